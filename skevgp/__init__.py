@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .estimators.bnn import BayesianMLPRegressor
     from .estimators.egp import EGPRegressor
     from .estimators.evgp import EVGPRegressor
+    from .estimators.report import FeatureReport, feature_report
     from .estimators.residual import ResidualRegressor
     from .fitting.prior import CoefPrior
     from .identification.inverse_dynamics import InverseDynamics
@@ -22,11 +23,13 @@ __all__ = [
     "CoefPrior",
     "EGPRegressor",
     "EVGPRegressor",
+    "FeatureReport",
     "InverseDynamics",
     "ResidualRegressor",
     "__version__",
     "datasets",
     "exceptions",
+    "feature_report",
     "features",
     "io",
     "kernels",
@@ -43,8 +46,10 @@ _HOME = {
     "CoefPrior": "fitting.prior",
     "EGPRegressor": "estimators.egp",
     "EVGPRegressor": "estimators.evgp",
+    "FeatureReport": "estimators.report",
     "InverseDynamics": "identification.inverse_dynamics",
     "ResidualRegressor": "estimators.residual",
+    "feature_report": "estimators.report",
     "rollout": "control.rollout",
 }
 

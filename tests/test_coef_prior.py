@@ -284,7 +284,9 @@ COVARIANCE = np.array([[4.0, 3.0, 0.0], [3.0, 9.0, 0.0], [0.0, 0.0, 1.0]])
 
 @pytest.mark.parametrize("groups", [["a", "b", "a"], ["a", "", "b"], [["a", "a", "b"], ["a", "b", "b"]]])
 def test_groups_that_are_correlated_raise(groups):
-    with pytest.raises(ValueError, match=r"Weights of different groups must be independent; .*CoefPrior\(groups=None\)"):
+    with pytest.raises(
+        ValueError, match=r"Weights of different groups must be independent; .*CoefPrior\(groups=None\)"
+    ):
         resolve(FunctionTransformer(), cov=COVARIANCE, groups=groups)
     with pytest.raises(ValueError, match="Weights of different groups must be independent"):
         resolve(Opinionated(np.zeros((2, 3)), COVARIANCE), groups=groups)

@@ -32,7 +32,15 @@ from .summary import ModelSummary, html_of, of_gaussian_process
 
 P = ParamSpec("P")
 # Attributes of models with weights only.
-_OF_WEIGHTS = ("coef_", "coef_std_", "coef_cov_", "coef_names_", "coef_prior_mean_", "coef_prior_scale_")
+_OF_WEIGHTS = (
+    "coef_",
+    "coef_std_",
+    "coef_cov_",
+    "coef_names_",
+    "coef_prior_mean_",
+    "coef_prior_scale_",
+    "coef_groups_",
+)
 # Attributes that are computed when they are read.
 _AFTER_FIT = ("lower_bound_", "upper_bound_")
 # Arguments of version 0.1, and their new places.
@@ -281,6 +289,8 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             first = 0 if self._n_outputs == 1 or predictor.shared else slice(None)
             self.coef_names_ = coef_names(self.feature_map_, maps.columns, self.coef_.shape[-1])
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
+            labels = np.array([*prior.labels, ""], dtype=object)
+            self.coef_groups_ = labels[np.full(prior.scale.shape, -1) if prior.groups is None else prior.groups][first]
         kernels = [
             spec.to_sklearn(
                 group.hyperparameters,

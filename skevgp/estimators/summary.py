@@ -136,10 +136,10 @@ class ModelSummary:
         parts = [f"<p><b>{escape(self.title)}</b><br>{escape(self.certificate)}</p>"]
         for output, facts in self._facts():
             parts.append("" if output is None else f"<p>output <b>{escape(str(output))}</b></p>")
-            parts.append(_html_table(list(facts.items())))
+            parts.append(html_table(list(facts.items())))
         table = list(self._weights())
         if len(table) > 1:
-            parts.append(f"<div {_SCROLLED}>{_html_table(table[1:], table[0])}</div>")
+            parts.append(f"<div {_SCROLLED}>{html_table(table[1:], table[0])}</div>")
         return f'<div style="font-size: 0.9em">{"".join(parts)}</div>'
 
     def _facts(self) -> Iterator[tuple[int | str | None, dict[str, str]]]:
@@ -273,7 +273,7 @@ def _plus_minus(value: float, std: float) -> str:
     return f"{value:.4g}" if np.isnan(std) else f"{value:.4g} ± {std:.2g}"
 
 
-def _html_table(lines: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
+def html_table(lines: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
     head = "".join(f"<th {_CELL}>{escape(cell)}</th>" for cell in header)
     rows = "".join(f"<tr>{''.join(f'<td {_CELL}>{escape(cell)}</td>' for cell in line)}</tr>" for line in lines)
     return f"<table {_TABLE}>{f'<thead><tr>{head}</tr></thead>' if header else ''}<tbody>{rows}</tbody></table>"

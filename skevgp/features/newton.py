@@ -88,12 +88,17 @@ class InertiaForce(_NewtonFeatures):
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
-    known_scale : float, default=0.1
-        Prior standard deviation of the known entries (1 and Δt). It allows for the error of Euler's rule.
-    unknown_scale : float, default=1.0
-        Prior standard deviation of the entries γ, whose values physics does not know.
-    free_scale : float, default=1.0
-        Prior standard deviation of all other entries, whose mean is 0. With 0 they stay 0.
+    known_rate : float, default=0.3
+        Prior standard deviation of the weights that Newton's law gives, as a rate in 1/s: the weight of a velocity for
+        itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
+    unknown_ratio : float, default=3.0
+        Prior standard deviation of what an input contributes to the velocity of its own joint, as a multiple of the
+        change that the prior mean of all features leaves (see Notes).
+    coupling_ratio : float, default=0.3
+        The same for inputs at other joints, which act through the mass matrix. With 0 these weights stay 0.
+    other_ratio : float, default=0.003
+        The same for all other weights: those that are 0 in Newton's law, and the 1 of a position for itself. With 0
+        they stay at their mean.
 
     Attributes
     ----------
@@ -107,15 +112,22 @@ class InertiaForce(_NewtonFeatures):
 
     Notes
     -----
-    Do not scale the columns of X before this map, because the prior is in SI units. Scale in the ``kernel_map`` of the
-    regressor, which only the kernel uses.
+    A standard deviation that is given as a ratio is in units of the data, and fits any robot and time step: it is the
+    ratio times rms(y - h(x)ᵀμ) / rms(feature), where μ is the prior mean of the weights of all features. The prior
+    standard deviations for a position are Δt times those for its velocity. If y has a position without its velocity,
+    they follow from what the prior mean leaves of the position.
+
+    The scale of each group of weights (``"known"``, ``"input"``, ``"coupling"`` and ``"other"``) is then learned with
+    the kernel, for each output (see ``groups`` of `skevgp.CoefPrior`).
+
+    Do not scale the columns of X before this map, because Euler's rule holds only if velocities are the derivatives of
+    positions. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
 
     With ``dt="column"`` the features are :math:`[z, \Delta t\,z, \Delta t\,u]` with the state :math:`z = [q, \dot q]`,
     for :math:`z' = z + \Delta t\,(A z + B u)`. The weights of z are fixed to 1 and 0. All others are rates in SI units
-    and the same for any Δt: 1 for :math:`\dot q` in the rows of positions, ``inverse_inertia`` for u, and 0. Their
-    prior standard deviations are those above divided by 0.03 s, so that the prior of h(x)β equals that of ``dt=0.03``
-    if the column is 0.03. Euler's rule neglects ½ Δt times the second derivative, which biases the weights. Short steps
-    identify physics best.
+    and the same for any Δt: 1 for :math:`\dot q` in the rows of positions, ``inverse_inertia`` for u, and 0. For Δt in
+    the prior standard deviations, the mean of the column in `fit` is used. Euler's rule neglects ½ Δt times the second
+    derivative, which biases the weights. Short steps identify physics best.
 
     Examples
     --------
@@ -123,10 +135,11 @@ class InertiaForce(_NewtonFeatures):
     >>> features = InertiaForce("pendulum").fit([[0.1, 0.0, 1.0]])
     >>> features.get_feature_names_out().tolist()
     ['q', 'dq/dt', 'u_q']
-    >>> mean, scale = features.coef_prior(n_outputs=2)
-    >>> mean
+    >>> features.coef_prior(n_outputs=2)[0]
     array([[1.  , 0.03, 0.  ],
            [0.  , 1.  , 0.  ]])
+    >>> features.coef_groups(n_outputs=2)[1].tolist()
+    ['other', 'known', 'input']
 
     Features of a log whose rows have different time steps, with 1/J about 4:
 
@@ -191,20 +204,26 @@ class InertiaForceGravity(_NewtonFeatures):
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     gravity : LinkGravity, default=None
-        Other features of gravity, with their own prior scales. If None, the sines for the pendulum, cartpole and
-        acrobot, and for other robots `LinkGravity` of all links whose features are not always 0.
+        Other features of gravity, with their own ``unknown_ratio`` and ``coupling_ratio``. If None, the sines for the
+        pendulum, cartpole and acrobot, and for other robots `LinkGravity` of all links whose features are not always 0.
     gravity_gain : float or array-like of shape (n_terms,) or (n_joints, n_terms), default=0.0
         Guess of the deceleration by gravity per unit of each feature: one for all, one per feature, or one per joint
         and feature, where entries of joints that the feature does not accelerate are ignored. For a sine it is in
         rad/s² (g/l for a point mass), for a lever of `LinkGravity` in 1/m (1/l for a point mass at -l times the lever).
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
-    known_scale : float, default=0.1
-        Prior standard deviation of the known entries (1 and Δt). It allows for the error of Euler's rule.
-    unknown_scale : float, default=1.0
-        Prior standard deviation of the entries γ and those of gravity, whose values physics does not know.
-    free_scale : float, default=1.0
-        Prior standard deviation of all other entries, whose mean is 0. With 0 they stay 0.
+    known_rate : float, default=0.3
+        Prior standard deviation of the weights that Newton's law gives, as a rate in 1/s: the weight of a velocity for
+        itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
+    unknown_ratio : float, default=3.0
+        Prior standard deviation of what an input contributes to the velocity of its own joint, and gravity to those of
+        the joints that it pulls, as a multiple of the change that the prior mean of all features leaves (see the Notes
+        of `InertiaForce`).
+    coupling_ratio : float, default=0.3
+        The same for inputs and gravity at other joints, which act through the mass matrix. With 0 these weights stay 0.
+    other_ratio : float, default=0.003
+        The same for all other weights: those that are 0 in Newton's law, and the 1 of a position for itself. With 0
+        they stay at their mean.
 
     Attributes
     ----------
@@ -222,8 +241,11 @@ class InertiaForceGravity(_NewtonFeatures):
     Do not scale the columns of X before this map, because the sine of a scaled angle is not gravity. Scale in the
     ``kernel_map`` of the regressor, which only the kernel uses.
 
-    With ``dt="column"``, see the Notes of `InertiaForce`. Features of gravity are multiplied by Δt too, and the mean of
-    their weights is minus ``gravity_gain``.
+    See the Notes of `InertiaForce` on prior standard deviations. The groups of weights whose scales are learned are
+    ``"known"``, ``"input"``, ``"gravity"``, ``"coupling"`` and ``"other"``.
+
+    With ``dt="column"``, see the Notes of `InertiaForce`, too. Features of gravity are multiplied by Δt, and the mean
+    of their weights is minus ``gravity_gain``.
 
     Examples
     --------
@@ -236,6 +258,8 @@ class InertiaForceGravity(_NewtonFeatures):
     >>> features.coef_prior(n_outputs=2)[0]
     array([[ 1.  ,  0.03,  0.  ,  0.  ],
            [ 0.  ,  1.  ,  0.12, -0.6 ]])
+    >>> features.coef_groups(n_outputs=2)[1].tolist()
+    ['other', 'known', 'input', 'gravity']
 
     An arm in 3D, with two levers for each of the links 2 to 7:
 

@@ -272,7 +272,6 @@ class RigidBodyRegressor(RobotTransformer):
         covariance[range(links.size, len(mean)), range(links.size, len(mean))] = friction**2
         return mean, covariance
 
-
     @available_if(has_robot)
     def coef_groups(self, n_outputs: int) -> np.ndarray:
         """Name the groups of weights whose prior standard deviations are learned together.

@@ -365,12 +365,16 @@ class RobotMap(RobotTransformer):
         Returns
         -------
         labels : ndarray of str of shape (n_outputs, n_features_out)
-            The group of each weight. The weights for a position have the groups of those for its velocity.
+            The group of each weight. The weights for a position have the groups of those for its velocity, or "known"
+            if Newton's law gives them.
         """
         layout = self._known_layout()
         rows = self._checked_states(layout, n_outputs)
-        labels = self._with_kept(self._velocity_prior(layout).group, layout, "")
-        return labels[[row % layout.n_joints for row in rows]]
+        labels = self._velocity_prior(layout).group
+        # Newton's law gives the weights of a position that are not 0.
+        of_positions = np.where(self._mean(layout, STEP)[: layout.n_joints] != 0.0, "known", labels)
+        labels = self._with_kept(np.vstack([of_positions, labels]), layout, "")
+        return labels[rows]
 
     def _known_layout(self) -> Layout:
         return self._layout if hasattr(self, "_layout") else layout_of(self.robot)

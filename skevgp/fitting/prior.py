@@ -146,7 +146,7 @@ def resolved(
         )
     by_hand = _word(prior.scale) != "auto" or prior.cov is not None
     parts: list[_Part] = []
-    if feature_map is not None and not (by_hand and _word(prior.mean) != "auto" and _word(prior.groups) != "auto"):
+    if feature_map is not None and not (by_hand and _word(prior.mean) != "auto"):
         parts = list(_parts(feature_map, safe_indexing(X, slice(0, 1)), np.arange(shape[1])))
     mean, scale, correlation = np.zeros(shape), np.full(shape, np.nan), _independent(shape)
     for part in parts:
@@ -175,7 +175,7 @@ def resolved(
     mean, scale = mean.astype(float), scale.astype(float)
     if (correlation == _independent(shape)).all():
         return Resolved(mean, scale, None, groups)
-    root = np.array([_root(own, labels) for own, labels in zip(correlation, groups, strict=True)])
+    root = np.array([root_of_correlation(own, labels) for own, labels in zip(correlation, groups, strict=True)])
     return Resolved(mean, scale, scale[:, :, np.newaxis] * root, groups)
 
 
@@ -193,7 +193,14 @@ def _in_units_of_data(scale: np.ndarray, mean: np.ndarray, parts: Sequence[_Part
     for part in asking:
         # A feature that is 0 on all rows has no size. Its weight may have any scale.
         size = data.size[..., part.columns] / abs(part.weight)
-        found = part.feature_map.coef_scale(left_over, np.where(size > 0.0, size, 1.0)) / abs(part.weight)
+        found = as_floats(part.feature_map.coef_scale(left_over, np.where(size > 0.0, size, 1.0)), "A scale of a map")
+        allowed = _shapes((len(mean), len(part.columns)))
+        if found.shape not in allowed:
+            raise ValueError(
+                f"coef_scale of {part.feature_map!r} must return standard deviations of the shape {allowed[0]}; got "
+                f"{found.shape}."
+            )
+        found = found.reshape(allowed[0]) / abs(part.weight)
         missing = np.isnan(scale[:, part.columns])
         scale[:, part.columns] = np.where(missing, found, scale[:, part.columns])
     return np.where(np.isnan(scale), data.wide, scale)
@@ -217,13 +224,19 @@ def _groups(
         return groups
     labelled = [part for part in parts if hasattr(part.feature_map, "coef_groups")]
     for part in [] if by_hand else labelled:
-        labels = np.asarray(part.feature_map.coef_groups(n_outputs), dtype=object).reshape(shape[0], -1)
+        allowed = _shapes((shape[0], len(part.columns)))
+        labels = np.asarray(part.feature_map.coef_groups(n_outputs), dtype=object)
+        if labels.shape not in allowed:
+            raise ValueError(
+                f"coef_groups of {part.feature_map!r} must return labels of the shape {allowed[0]}; got {labels.shape}."
+            )
+        labels = labels.reshape(allowed[0])
         prefix = f"{part.name}: " if len(labelled) > 1 and part.name else ""
         groups[:, part.columns] = [[f"{prefix}{label}" if label else "" for label in row] for row in labels]
     return groups
 
 
-def _root(correlation: np.ndarray, groups: np.ndarray) -> np.ndarray:
+def root_of_correlation(correlation: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """A C (p, p) with C Cᵀ = ``correlation``, in which weights of different groups have nothing in common."""
     root = np.zeros(correlation.shape)
     for group in dict.fromkeys(groups):
@@ -344,7 +357,7 @@ def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") ->
             yield from _parts(steps[-1], first, columns, name)
     else:
         for own_name, part, part_first, own, weight in _parts_of(feature_map, first):
-            for inner in _parts(part, part_first, columns[own], own_name):
+            for inner in _parts(part, part_first, columns[own], f"{name}: {own_name}" if name else own_name):
                 yield inner._replace(weight=weight * inner.weight)
 
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from .problem import Problem
 
 # Lowest noise variance in squared target units: about the rounding error of the residuals.
+LOWEST_NOISE = 1e-20
 # Limits of the factors of the standard deviations of groups of weights.
 _FACTOR_LIMITS = 1e-4, 1e4
-LOWEST_NOISE = 1e-20
 _NEIGHBOUR_SAMPLE = 2000
 
 
@@ -137,8 +137,8 @@ def starting_table(
     signal, highest, centre = o / mean_variance, rules.highest_noise * precision * o, column_centre(inputs)
     lowest_noise = np.maximum(rules.lowest_noise * scatter, np.maximum(LOWEST_NOISE, rounding) * precision)
     still = bool(np.all(constant))
-    n_groups = (1 if units.prior.shared else len(o)), units.prior.n_groups
-    factors = [Parameter("coef_factors", np.ones(n_groups), "log", *_FACTOR_LIMITS)] if units.prior.labels else []
+    shape = (1 if units.prior.shared else len(o)), units.prior.n_groups
+    factors = [Parameter("coef_factors", np.ones(shape), "log", *_FACTOR_LIMITS)] if units.prior.labels else []
     return ParameterTable(
         [
             parameter_of(

@@ -71,6 +71,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     stiction_velocity : "auto" or None, default="auto"
         If ``"auto"``, find the speed above which the sign of friction of each joint is known, which needs at least
         three ``groups``. If None, use that of `RigidBodyRegressor`.
+    learn_scales : bool, default=True
+        Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
+        each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
+        it.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -91,8 +95,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     coef_names_ : ndarray of str of shape (n_h,)
         Names of the weights: m(q1), mcx(q1), ..., viscous(q1), ...
     coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
-        Prior means and standard deviations of β. Torques do not determine a weight whose standard deviation is still
-        that of the prior.
+        Prior means and learned prior standard deviations of β. Torques do not determine a weight whose standard
+        deviation is still that of the prior.
     gains_, gains_std_ : ndarray of shape (n_outputs,)
         Gains 1 + c and their standard deviations. Torques of the model times gains are those of y.
     noise_variance_ : ndarray of shape (n_outputs,)
@@ -167,6 +171,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         "gain_scale": [Interval(Real, 0, None, closed="left")],
         "consistent": ["boolean"],
         "stiction_velocity": [StrOptions({"auto"}), None],
+        "learn_scales": ["boolean"],
         "n_inducing": [Interval(Integral, 0, None, closed="left")],
         "max_rows": [Interval(Integral, 10, None, closed="left")],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -181,6 +186,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         gain_scale: float = 0.0,
         consistent: bool = False,
         stiction_velocity: Literal["auto"] | None = "auto",
+        learn_scales: bool = True,
         n_inducing: int = 40,
         max_rows: int = 3000,
         max_iter: int | None = None,
@@ -191,6 +197,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.gain_scale = gain_scale
         self.consistent = consistent
         self.stiction_velocity = stiction_velocity
+        self.learn_scales = learn_scales
         self.n_inducing = n_inducing
         self.max_rows = max_rows
         self.max_iter = max_iter

@@ -28,6 +28,7 @@ class TorqueRegression(StatefulEstimator):
     robot: Any
     gain_scale: float
     stiction_velocity: Literal["auto"] | None
+    learn_scales: bool
     feature_map_: Any
     _weights: Weights
 
@@ -92,7 +93,8 @@ class TorqueRegression(StatefulEstimator):
                 break
             with ignored(category=RobotModelWarning):  # given already
                 self.feature_map_.set_params(stiction_velocity=velocity).fit(X)
-            rows, prior = replace(rows, features=self._features(X, y.shape[1])), replace(prior, velocity=velocity)
+            rows = replace(rows, features=self._features(X, y.shape[1]))
+            prior = replace(self._weights.prior, velocity=velocity)
             self._weights = identify(rows, prior, start=self._weights)
         return rows
 
@@ -132,5 +134,8 @@ class TorqueRegression(StatefulEstimator):
         coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
         inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)
         velocity = np.broadcast_to(getattr(self.feature_map_, "stiction_velocity", 0.01), n_outputs)  # v_s, (o,)
-        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, velocity)
+        groups = None
+        if self.learn_scales and hasattr(self.feature_map_, "coef_groups"):
+            groups = np.asarray(self.feature_map_.coef_groups(n_outputs), dtype=object)
+        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, velocity, groups)
         return with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.optimize import brentq
 
+from ..fitting.prior import root_of_correlation
 from .rows_of_logs import correlation_time
 from .stiction import JointNoise, likeliest_noise
 
@@ -45,6 +47,12 @@ class Prior:
     scaled: np.ndarray  # (p,) weights that gains multiply; friction is in the units of the measurement
     coulomb: np.ndarray | None  # (o,) index of Coulomb friction of each output, or None without static friction
     velocity: np.ndarray  # (o,) speed below which friction has no sign
+    # (P,): labels of groups whose standard deviations are learned. They are independent of each other. Empty: it stays.
+    groups: np.ndarray | None = None
+
+    def scaled_by(self, factors: np.ndarray) -> Prior:
+        """Return the prior with standard deviations times factors (P,), which then stay."""
+        return replace(self, covariance=self.covariance * np.outer(factors, factors), groups=None)
 
 
 @dataclass(frozen=True)
@@ -99,6 +107,10 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
     # filtered rows count less. Scores s_b = B_bᵀ e_b of groups should then differ as much as their information
     # predicts. If they differ more, all information is divided by that ratio, the inflation.
     #
+    # The standard deviations of each group of weights are multiplied by a factor t with a log-normal prior, as in
+    # `model.parameters.log_prior`. A step of expectation maximisation sets t to the maximum of
+    # -n log t - ½ E[|z|²] t₀² / t² - ½ log² t, with n weights z of the group under the last factor t₀.
+    #
     # With a start, weights and noise start there. Otherwise they start twice, with a prior that explains nothing and
     # one that explains nearly everything, and the more probable end is kept.
     problem = _Problem.of(rows, prior, known)
@@ -106,8 +118,11 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
         ends = [problem.settled(problem.first(share), _TRIAL_ROUNDS) for share in _FIRST_NOISE]
         state = max(ends, key=problem.log_probability)
     else:
-        state = _State(start.mean, start.noise, start.correlation_time)
+        state = _State(start.mean, start.noise, start.correlation_time, np.ones(len(prior.mean)))
     state = problem.settled(state, _ROUNDS)
+    factors = state.factors
+    problem, prior = replace(problem, root=factors[:, np.newaxis] * problem.root), prior.scaled_by(factors)
+    state = replace(state, factors=np.ones(len(factors)))
     B, errors = problem.whitened(state)
     z, covariance = _solve(B, errors)
     of_rows = B[: rows.targets.size].reshape(*rows.targets.shape, -1)
@@ -118,7 +133,8 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
         weight[: rows.targets.size] = inflation**-0.5
         z, covariance = _solve(B * weight[:, np.newaxis], errors * weight)
     mean, root = prior.mean + problem.root @ z, problem.root
-    surprise = float(np.sqrt(z @ z / max(1.0, len(z) - np.trace(covariance))))
+    # In standard deviations of the prior as given.
+    surprise = float(np.sqrt(np.sum((factors * z) ** 2) / max(1.0, len(z) - np.trace(covariance))))
     return Weights(mean, root @ covariance @ root.T, prior, state.noise, state.times, inflation, surprise)
 
 
@@ -158,6 +174,7 @@ class _State:
     mean: np.ndarray
     noise: list[JointNoise]
     times: np.ndarray
+    factors: np.ndarray  # (P,) of the prior's standard deviations
 
 
 @dataclass(frozen=True)
@@ -174,7 +191,7 @@ class _Problem:
     def of(cls, rows: Rows, prior: Prior, known: Known | None) -> _Problem:
         y = rows.targets
         size = np.where(y.var(axis=0) > 0.0, y.var(axis=0), np.max(y**2, axis=0))
-        return cls(rows, prior, known, _root(prior.covariance), np.where(size > 0.0, size, 1.0))
+        return cls(rows, prior, known, _root(prior.covariance, prior.groups), np.where(size > 0.0, size, 1.0))
 
     def first(self, share: float) -> _State:
         """Return a state with this share of each output's variance as noise."""
@@ -182,20 +199,22 @@ class _Problem:
             JointNoise(float(share * size), 0.0, float(velocity))
             for size, velocity in zip(self.size, self.prior.velocity, strict=True)
         ]
-        return _State(self.prior.mean, noise, np.ones(len(noise)))
+        return _State(self.prior.mean, noise, np.ones(len(noise)), np.ones(len(self.prior.mean)))
 
     def settled(self, state: _State, rounds: int) -> _State:
         """Return the state after this number of rounds, or when noise hardly changes."""
         for _ in range(rounds):
             last, state = state, self._next(state)
             moved = [np.log(new.variance / old.variance) for new, old in zip(state.noise, last.noise, strict=True)]
-            if np.abs(moved).max() < _SETTLED and np.abs(np.log(state.times / last.times)).max() < _SETTLED:
+            moved += [*np.log(state.times / last.times), *np.log(state.factors / last.factors)]
+            if np.abs(moved).max() < _SETTLED:
                 break
         return state
 
     def _next(self, state: _State) -> _State:
         rows, prior = self.rows, self.prior
-        mean = prior.mean + self.root @ _solve(*self.whitened(state))[0]
+        z, covariance = _solve(*self.whitened(state))
+        mean = prior.mean + state.factors * (self.root @ z)
         left = rows.targets - _forward(rows.features, mean, prior)
         coulomb = np.zeros(len(self.size)) if prior.coulomb is None else np.abs(mean[prior.coulomb])
         noise = [
@@ -204,7 +223,22 @@ class _Problem:
         ]
         spread = np.sqrt(_variances(noise, rows.speed))
         times = np.array([correlation_time(errors, rows.runs) for errors in (left / spread).T])
-        return _State(mean, noise, times)
+        return _State(mean, noise, times, self._next_factors(state, z**2 + np.diag(covariance)))
+
+    def _next_factors(self, state: _State, squares: np.ndarray) -> np.ndarray:
+        """Return the factors (P,) after a step of expectation maximisation, given E[z²] (P,)."""
+        factors = state.factors.copy()
+        if self.prior.groups is None:
+            return factors
+        for group in dict.fromkeys(self.prior.groups):
+            if group:
+                own = self.prior.groups == group
+                n, total = own.sum(), squares[own].sum() * factors[own][0] ** 2
+                # -n + total / t² - log t falls with t. Its zero is between 1 and √(total / n).
+                ends = sorted([0.0, 0.5 * np.log(max(total, np.finfo(float).tiny) / n)])
+                if ends[0] < ends[1]:
+                    factors[own] = np.exp(brentq(lambda log: total * np.exp(-2.0 * log) - n - log, *ends))  # noqa: B023
+        return factors
 
     def whitened(self, state: _State) -> tuple[np.ndarray, np.ndarray]:
         """Return B and errors of the linear model errors = B z + N(0, I), z ~ N(0, I), for rows and then known rows."""
@@ -215,7 +249,8 @@ class _Problem:
         Bs, errors = [], []
         for features, targets, weight in parts:
             slopes, linear = _linearised(features, targets, state.mean, self.prior)
-            Bs.append(((slopes * weight[:, :, np.newaxis]) @ self.root).reshape(-1, self.root.shape[1]))
+            root = state.factors[:, np.newaxis] * self.root
+            Bs.append(((slopes * weight[:, :, np.newaxis]) @ root).reshape(-1, root.shape[1]))
             errors.append(((linear - slopes @ self.prior.mean) * weight).ravel())
         return np.concatenate(Bs), np.concatenate(errors)
 
@@ -224,7 +259,9 @@ class _Problem:
         variances = _variances(state.noise, self.rows.speed)
         left = self.rows.targets - _forward(self.rows.features, state.mean, self.prior)
         z = _solve(*self.whitened(state))[0]
-        return -0.5 * float(np.sum(np.log(variances) + left**2 / variances) + z @ z)
+        # Of each group once.
+        logs = np.log(np.unique(state.factors))
+        return -0.5 * float(np.sum(np.log(variances) + left**2 / variances) + z @ z + logs @ logs)
 
 
 def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:
@@ -235,7 +272,8 @@ def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:
     covariance = np.zeros((len(mean), len(mean)))
     covariance[:-n_outputs, :-n_outputs] = prior.covariance
     covariance[-n_outputs:, -n_outputs:] = scale**2 * np.eye(n_outputs)
-    return replace(prior, mean=mean, covariance=covariance)
+    groups = None if prior.groups is None else np.concatenate([prior.groups, [""] * n_outputs])
+    return replace(prior, mean=mean, covariance=covariance, groups=groups)
 
 
 def _forward(features: np.ndarray, mean: np.ndarray, prior: Prior) -> np.ndarray:
@@ -290,9 +328,9 @@ def _inflation(B: np.ndarray, errors: np.ndarray, covariance: np.ndarray, groups
     return float(max(1.0, seen / expected)) if expected > 0.0 else 1.0
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """Return C with C Cᵀ = covariance, which may be singular."""
+def _root(covariance: np.ndarray, groups: np.ndarray | None) -> np.ndarray:
+    """Return C with C Cᵀ = covariance, which may be singular, without entries between groups."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     unit = np.where(scale > 0.0, scale, 1.0)
-    eigenvalues, vectors = eigh(covariance / np.outer(unit, unit))
-    return scale[:, np.newaxis] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    labels = np.zeros(len(scale)) if groups is None else groups
+    return scale[:, np.newaxis] * root_of_correlation(covariance / np.outer(unit, unit), labels)

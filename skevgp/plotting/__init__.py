@@ -2,6 +2,7 @@
 
 from .calibration import CalibrationDisplay
 from .coefficients import CoefficientDisplay
+from .feature_report import FeatureReportDisplay
 from .learning_curve import LearningCurveDisplay
 from .loss import LossDisplay
 from .posterior import PosteriorDisplay
@@ -11,6 +12,7 @@ from .signals import SignalsDisplay
 __all__ = [
     "CalibrationDisplay",
     "CoefficientDisplay",
+    "FeatureReportDisplay",
     "LearningCurveDisplay",
     "LossDisplay",
     "PosteriorDisplay",

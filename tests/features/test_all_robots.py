@@ -41,7 +41,7 @@ def uses(robot):
     rows, torque_rows = rng.uniform(-1.0, 1.0, (1, layout.n_columns)), rng.uniform(-1.0, 1.0, (1, 3 * n))
 
     def prior_of(feature_map, n_outputs):
-        """Mean and standard deviations. Those in units of the data are 0 where the map has its own."""
+        """Mean and standard deviations, for data of size 1. Each is either the map's own or in units of the data."""
         if not hasattr(feature_map, "coef_prior"):
             return []
         mean, own = feature_map.coef_prior(n_outputs)
@@ -50,7 +50,7 @@ def uses(robot):
         in_units = feature_map.coef_scale(np.ones(n_outputs), np.ones(mean.shape[1]))
         assert_array_equal(np.isnan(in_units), ~np.isnan(own))
         assert feature_map.coef_groups(n_outputs).shape == mean.shape
-        return [mean, np.nan_to_num(own), np.nan_to_num(in_units)]
+        return [mean, np.where(np.isnan(own), in_units, own)]
 
     def mapped(feature_map, X, n_outputs=2 * n):
         before = prior_of(feature_map, n_outputs)

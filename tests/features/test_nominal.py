@@ -10,7 +10,7 @@ from sklearn.pipeline import FeatureUnion
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics, perturb_robot, simulate
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
-from skevgp.fitting.prior import CoefPrior, resolved
+from skevgp.fitting.prior import CoefPrior, InData, resolved
 from skevgp.metrics import prediction_error
 from skevgp.robots import System, layout_of, load_robot
 from skevgp.robots.systems import Link
@@ -52,6 +52,13 @@ def by_pinocchio(robot, term, X):
 
 def union(robot, nominal):
     return FeatureUnion([("if", InertiaForce(robot)), ("nominal", nominal)])
+
+
+def mean_of(features, X, n_outputs):
+    """The prior mean of the weights. It does not depend on the data."""
+    width = features.transform(X).shape[1]
+    data = InData(np.ones((n_outputs, width)), np.ones(width), lambda mean: np.ones(n_outputs))
+    return resolved(CoefPrior(), features, X, data, n_outputs).mean
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -99,10 +106,9 @@ def test_terms_come_in_the_order_given():
     each = [NominalDynamics("acrobot", terms=[term]).fit_transform(X) for term in ("bias", "acceleration")]
     assert_array_equal(both.transform(X), np.hstack(each))
     assert both.get_feature_names_out().tolist() == ["bias torque(q1)", "bias torque(q2)", "acc(q1)", "acc(q2)"]
-    assert_array_equal(
-        both.coef_prior(4)[1],
-        np.hstack([NominalDynamics("acrobot", terms=[term]).coef_prior(4)[1] for term in ("bias", "acceleration")]),
-    )
+    alone = [NominalDynamics("acrobot", terms=[term]) for term in ("bias", "acceleration")]
+    assert_array_equal(both.coef_prior(4)[1], np.hstack([each.coef_prior(4)[1] for each in alone]))
+    assert_array_equal(both.coef_groups(4), np.hstack([each.coef_groups(4) for each in alone]))
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -111,7 +117,7 @@ def test_prior_mean_beside_inertia_force_is_eulers_step_of_the_model(robot, term
     X, n = rows(robot), layout_of(robot).n_joints
     features = union(robot, NominalDynamics(robot, terms=terms))
     H = features.fit_transform(X)
-    mean, *_ = resolved(CoefPrior(), features, X, np.ones((2 * n, H.shape[1])), 2 * n)
+    mean = mean_of(features, X, 2 * n)
     _, v, _ = parts(robot, X)
     step = np.hstack([v, by_pinocchio(robot, "acceleration", X)])
     assert_allclose(H @ mean.T, X[:, : 2 * n] + DT * step, rtol=1e-9, atol=1e-10 * np.abs(step).max())
@@ -121,30 +127,41 @@ def test_prior_mean_is_what_a_short_step_does():
     dt, X = 1e-4, rows("acrobot")
     features = FeatureUnion([("if", InertiaForce("acrobot", dt=dt)), ("nominal", NominalDynamics("acrobot", dt=dt))])
     H = features.fit_transform(X)
-    mean, *_ = resolved(CoefPrior(), features, X, np.ones((4, H.shape[1])), 4)
+    mean = mean_of(features, X, 4)
     after = simulate("acrobot", X[:, :4], X[:, np.newaxis, 4:], dt)[:, 1]
     assert_allclose(H @ mean.T, after, rtol=0, atol=2e-6)
     assert np.abs(X[:, :4] - after).max() > 1e-4
 
 
-# Rows q1', q2', dq1/dt', dq2/dt'. Known (k), torques (t), and free (.).
+# For the velocity of each joint: the model's acceleration (m), torques of gravity (g) and bias (b), and others (.).
 @pytest.mark.parametrize(
-    ("terms", "roles"),
+    ("terms", "groups"),
     [
-        (["acceleration"], ["..", "..", "k.", ".k"]),
-        (["gravity"], ["..", "..", "tt", "tt"]),
-        (["bias"], ["..", "..", "tt", "tt"]),
-        (["input"], ["..", "..", "k.", ".k"]),
-        (["acceleration", "input"], ["....", "....", "k...", ".k.."]),
-        (["input", "acceleration"], ["....", "....", "..k.", "...k"]),
-        (["input", "gravity"], ["....", "....", "k.tt", ".ktt"]),
+        (["acceleration"], ["m.", ".m"]),
+        (["gravity"], ["gg", "gg"]),
+        (["bias"], ["bb", "bb"]),
+        (["input"], ["m.", ".m"]),
+        (["acceleration", "input"], ["m...", ".m.."]),
+        (["input", "acceleration"], ["..m.", "...m"]),
+        (["input", "gravity", "bias"], ["m.ggbb", ".mggbb"]),
     ],
 )
-def test_prior_knows_which_acceleration_moves_which_velocity(terms, roles):
-    features = NominalDynamics("acrobot", terms=terms, dt=0.1, known_scale=0.5, unknown_scale=7.0, free_scale=2.0)
-    mean, scale = features.coef_prior(4)
-    assert_allclose(mean, [[0.1 if role == "k" else 0.0 for role in row] for row in roles])
-    assert_allclose(scale, [[{"k": 0.05, "t": 7.0, ".": 0.2}[role] for role in row] for row in roles])
+def test_prior_knows_which_acceleration_moves_which_velocity(terms, groups):
+    features = NominalDynamics("acrobot", terms=terms, dt=0.1, model_error=0.5, unknown_ratio=7.0, other_ratio=0.2)
+    groups = np.array([list(row) for row in groups])
+    names = {"m": "model", "g": "gravity torques", "b": "bias torques", ".": "other accelerations"}
+    assert_array_equal(features.coef_groups(4), np.tile(np.vectorize(names.get)(groups), (2, 1)))
+    mean, own = features.coef_prior(4)
+    assert_allclose(mean, np.vstack([np.zeros(groups.shape), np.where(groups == "m", 0.1, 0.0)]))
+    assert_allclose(own[2:], np.where(groups == "m", 0.1 * 0.5, np.nan))
+    rng = np.random.default_rng(0)
+    left_over, size = rng.uniform(1.0, 2.0, 4), rng.uniform(1.0, 2.0, groups.shape[1])
+    in_units = features.coef_scale(left_over, size)
+    ratio = np.vectorize({"m": np.nan, "g": 7.0, "b": 7.0, ".": 0.2}.get)(groups)
+    assert_allclose(in_units[2:], ratio * left_over[2:, np.newaxis] / size)
+    # A velocity that changes moves its position by Δt times as much.
+    assert_allclose(own[:2], 0.1 * own[2:])
+    assert_allclose(in_units[:2], 0.1 * in_units[2:])
 
 
 def test_only_a_robot_gives_a_prior():
@@ -190,7 +207,7 @@ def test_model_of_another_size_raises():
         NominalDynamics(load_robot("iiwa14")).fit(rows("acrobot"))
 
 
-@pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
+@pytest.mark.parametrize("parameter", ["dt", "model_error", "unknown_ratio", "other_ratio"])
 @pytest.mark.parametrize("value", [-1.0, np.inf, np.nan, "much"])
 def test_invalid_parameter_raises(parameter, value):
     with pytest.raises(ValueError, match=f"The '{parameter}' parameter of NominalDynamics must be"):

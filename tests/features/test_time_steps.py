@@ -14,15 +14,16 @@ from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, Lin
 from skevgp.robots import layout_of
 
 TERMS = ("acceleration", "gravity", "bias", "input")
-GUESSES = {"inverse_inertia": 2.0, "known_scale": 0.07, "unknown_scale": 0.8, "free_scale": 0.3}
+RATIOS = {"known_rate": 0.6, "unknown_ratio": 5.0, "coupling_ratio": 0.5, "other_ratio": 0.02}
+GUESSES = {"inverse_inertia": 2.0, **RATIOS}
 # Each takes a robot and a dt: a number, which maps of gravity alone do not know, or "column".
 MAPS = {
     "inertia": partial(InertiaForce, **GUESSES),
     "inertia and gravity": partial(InertiaForceGravity, gravity_gain=3.0, **GUESSES),
     "gravity": lambda robot, dt: LinkGravity(
-        robot, unknown_scale=0.8, free_scale=0.3, dt=dt if dt == "column" else None
+        robot, unknown_ratio=5.0, coupling_ratio=0.5, dt=dt if dt == "column" else None
     ),
-    "dynamics": partial(NominalDynamics, terms=TERMS, known_scale=0.2, unknown_scale=0.8, free_scale=0.3),
+    "dynamics": partial(NominalDynamics, terms=TERMS, model_error=0.2, unknown_ratio=5.0, other_ratio=0.02),
 }
 each_map = pytest.mark.parametrize("kind", MAPS)
 ANY = {**MAPS, "angles": lambda robot, dt: AngleEncoder(robot, dt=dt)}
@@ -124,45 +125,58 @@ def test_at_a_constant_step_the_prior_mean_is_that_of_the_number(robot, kind, dt
     assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
-def covariances(features, H, n_states):
+def covariances(features, H, left_over):
     """Prior covariance of each output between all rows, (n_states, n, n)."""
-    scale = features.coef_prior(n_states)[1]
-    return np.einsum("np,op,mp->onm", H, scale**2, H)
+    _, scale = features.coef_prior(len(left_over))
+    size = np.sqrt(np.mean(H**2, axis=0))
+    in_units = features.coef_scale(left_over, np.where(size > 0.0, size, 1.0))
+    assert_array_equal(np.isnan(in_units), ~np.isnan(scale))
+    return np.einsum("np,op,mp->onm", H, np.where(np.isnan(scale), in_units, scale) ** 2, H)
 
 
 @each_map
 @pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot", "iiwa14"])
 @pytest.mark.parametrize("dt", [0.002, 0.03, 0.2])
-def test_prior_covariance_is_that_of_003_seconds_and_grows_with_the_step(robot, kind, dt):
-    X, n_states = rows(robot), 2 * layout_of(robot).n_joints
+def test_at_a_constant_step_the_prior_covariance_is_that_of_the_number(robot, kind, dt):
+    X, n = rows(robot), layout_of(robot).n_joints
     X[:, -1] = dt
-    expected = (dt / 0.03) ** 2 * covariances(*of_constant(kind, robot, X, 0.03), n_states)
+    left_of_velocity = np.random.default_rng(1).uniform(0.5, 2.0, n)
+    # Alone, gravity with the same step in all rows does not know it.
+    left_over = np.hstack([dt * left_of_velocity, left_of_velocity])
+    expected = covariances(*of_constant(kind, robot, X, dt), left_over)
     features = MAPS[kind](robot, dt="column")
-    found = covariances(features, features.fit_transform(X), n_states)
-    assert_allclose(found, expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
+    found = covariances(features, features.fit_transform(X), left_over)
+    for own, of_number in zip(found, expected, strict=True):
+        assert_allclose(own, of_number, rtol=1e-10, atol=1e-12 * of_number.max())
+    groups = MAPS[kind](robot, dt=dt).coef_groups(2 * n)
+    assert_array_equal(features.coef_groups(2 * n)[:, kept(kind, robot) :], groups)
 
 
 def test_weights_are_those_of_a_second():
-    features = InertiaForceGravity(
-        "cartpole",
-        dt="column",
-        inverse_inertia=0.1,
-        gravity_gain=20.0,
-        known_scale=0.06,
-        unknown_scale=0.3,
-        free_scale=0.9,
-    )
-    mean, scale = features.coef_prior(4)
+    features = InertiaForceGravity("cartpole", dt="column", inverse_inertia=0.1, gravity_gain=20.0, **RATIOS)
+    X = rows("cartpole")
+    step = X[:, -1].mean()
+    features.fit(X)
+    mean, own = features.coef_prior(4)
     rates = np.zeros((4, 6))
     rates[0, 2] = rates[1, 3] = 1.0
     rates[2, 4], rates[3, 5] = 0.1, -20.0
     assert_allclose(mean, np.hstack([np.eye(4), rates]), rtol=1e-12)
-    known, unknown, free = 2.0, 10.0, 30.0
-    of_rates = np.full((4, 6), free)
-    for row, column in [(0, 0), (0, 2), (1, 1), (1, 3), (2, 2), (3, 3)]:
-        of_rates[row, column] = known
-    of_rates[2, 4] = of_rates[3, 5] = unknown
-    assert_allclose(scale, np.hstack([np.zeros((4, 4)), of_rates]), rtol=1e-12)
+    # The weights of the state stay.
+    groups = features.coef_groups(4)
+    assert_array_equal(own[:, :4], 0.0)
+    assert_array_equal(groups[:, :4], "")
+    # For velocities x and theta; for positions, all is multiplied by the mean step.
+    known, unknown, coupling, other = 0.6, 5.0, 0.5, 0.02
+    nan = np.nan
+    of_rates = np.array([[nan, nan, known, nan, nan, nan], [nan, nan, nan, known, nan, nan]])
+    assert_allclose(own[:, 4:], np.vstack([step * of_rates, of_rates]), rtol=1e-12)
+    left_over, size = np.array([1.0, 2.0, 3.0, 4.0]), np.arange(1.0, 11.0)
+    ratios = [[other, other, nan, other, unknown, coupling], [other, other, other, nan, coupling, unknown]]
+    of_rates = np.array(ratios) * [[3.0], [4.0]] / size[4:]
+    in_units = features.coef_scale(left_over, size)
+    assert np.isnan(in_units[:, :4]).all()
+    assert_allclose(in_units[:, 4:], np.vstack([step * of_rates, of_rates]), rtol=1e-12)
 
 
 # --- errors --------------------------------------------------------------------------------------------------------
