@@ -11,6 +11,7 @@ import numpy as np
 
 from ..robots import GravityTerm, Layout, get_system, layout_of
 from ..robots.loading import Robot, joint_axes, known_robot
+from ..robots.systems import GRAVITY
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
 from .robot_map import RobotMap, VelocityPrior, indices_of
@@ -27,12 +28,14 @@ _COMPONENTS = {"u_x": (1, 1.0), "u_y": (0, -1.0), "": (2, 1.0)}
 class GravityMap(RobotMap):
     """Features of gravity alone, with a prior that knows which joints each feature accelerates."""
 
-    unknown_ratio: float
+    inverse_length: float
     coupling_ratio: float
+    # What a weight is per 1/l: 1 for features in m/s².
+    _per_length: ClassVar[float] = 1.0
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
-        "unknown_ratio": [Interval(Real, 0, None, closed="left")],
+        "inverse_length": [Interval(Real, 0, None, closed="left")],
         "coupling_ratio": [Interval(Real, 0, None, closed="left")],
     }
 
@@ -52,19 +55,23 @@ class GravityMap(RobotMap):
         return np.zeros((2 * layout.n_joints, len(self._terms())))
 
     def _velocity_prior(self, layout: Layout) -> VelocityPrior:
-        acts_on = self._acts_on(layout)
-        prior = VelocityPrior.of(layout.n_joints, acts_on.shape[1], self.coupling_ratio, "coupling")
-        prior.set(acts_on, self.unknown_ratio, "gravity")
+        # Gravity decelerates a link by g / l times the sine of its angle.
+        acts_on, rate = self._acts_on(layout), self._per_length * self.inverse_length
+        prior = VelocityPrior.of(layout.n_joints, acts_on.shape[1], np.nan, "")
+        prior.set_rate(acts_on, rate, "gravity")
+        prior.set_rate(~acts_on, self.coupling_ratio * rate, "coupling")
         return prior
 
 
 class SineGravity(GravityMap):
     """The sine of each angle against the vertical of a planar system, or of every column without a robot."""
 
-    def __init__(self, robot: Robot | None, unknown_ratio: float, coupling_ratio: float):
+    _per_length: ClassVar[float] = GRAVITY
+
+    def __init__(self, robot: Robot | None, inverse_length: float, coupling_ratio: float):
         self.robot = robot
         self.outputs = None
-        self.unknown_ratio = unknown_ratio
+        self.inverse_length = inverse_length
         self.coupling_ratio = coupling_ratio
 
     def _terms(self) -> Sequence[GravityTerm]:
@@ -132,12 +139,12 @@ class LinkGravity(GravityMap):
         The links, by the name of their joint or its index from 0 (the paper counts from 1). If None, all links.
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
-    unknown_ratio : float, default=1.0
-        Prior standard deviation of what the pull on a link contributes to the velocities of the joints between the base
-        and the link, as a multiple of the change that the prior mean of all features leaves.
+    inverse_length : float, default=3.0
+        Prior standard deviation of 1/l in 1/m, with the effective length l of a pendulum that the link would be. The
+        weights for the velocities of the joints between the base and the link are Δt times 1/l.
     coupling_ratio : float, default=0.3
-        The same for the velocities of other joints, which the pull moves through the mass matrix. With 0 these weights
-        stay 0.
+        The same for the velocities of other joints, which the pull moves through the mass matrix, as a share of that.
+        With 0 these weights stay 0.
     dt : "column" or None, default=None
         If ``"column"``, X has a last column, the time step Δt of each row in seconds, and features are multiplied by
         it. Weights are then rates (1/m for a lever).
@@ -193,7 +200,7 @@ class LinkGravity(GravityMap):
         axes: str = "xy",
         links: Sequence[int | str] | None = None,
         outputs: Sequence[int | str] | None = None,
-        unknown_ratio: float = 1.0,
+        inverse_length: float = 3.0,
         coupling_ratio: float = 0.3,
         dt: Literal["column"] | None = None,
     ):
@@ -201,7 +208,7 @@ class LinkGravity(GravityMap):
         self.axes = axes
         self.links = links
         self.outputs = outputs
-        self.unknown_ratio = unknown_ratio
+        self.inverse_length = inverse_length
         self.coupling_ratio = coupling_ratio
         self.dt = dt
 

@@ -54,7 +54,7 @@ class _NewtonFeatures(RobotMap):
     def _velocity_prior(self, layout: Layout) -> VelocityPrior:
         n, joints = layout.n_joints, np.arange(layout.n_joints)
         prior = VelocityPrior.of(n, layout.n_columns, self.other_ratio, "other")
-        prior.set(np.s_[:, 2 * n :], self.coupling_ratio, "coupling")
+        prior.set(np.s_[:, 2 * n :], self.coupling_ratio * self.unknown_ratio, "coupling")
         prior.set((np.array(layout.driven), 2 * n + np.arange(layout.n_inputs)), self.unknown_ratio, "input")
         prior.set_rate((joints, n + joints), self.known_rate, "known")
         return prior
@@ -91,14 +91,15 @@ class InertiaForce(_NewtonFeatures):
     known_rate : float, default=0.3
         Prior standard deviation of the weights that Newton's law gives, as a rate in 1/s: the weight of a velocity for
         itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
-    unknown_ratio : float, default=3.0
+    unknown_ratio : float, default=1.0
         Prior standard deviation of what an input contributes to the velocity of its own joint, as a multiple of the
         change that the prior mean of all features leaves (see Notes).
     coupling_ratio : float, default=0.3
-        The same for inputs at other joints, which act through the mass matrix. With 0 these weights stay 0.
+        The same for inputs at other joints, which act through the mass matrix, as a share of ``unknown_ratio``. With 0
+        these weights stay 0.
     other_ratio : float, default=0.003
-        The same for all other weights: those that are 0 in Newton's law, and the 1 of a position for itself. With 0
-        they stay at their mean.
+        Prior standard deviation of what all other features contribute, as a multiple of the same change. These weights
+        are 0 in Newton's law, or the 1 of a position for itself. With 0 they stay at their mean.
 
     Attributes
     ----------
@@ -204,7 +205,7 @@ class InertiaForceGravity(_NewtonFeatures):
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     gravity : LinkGravity, default=None
-        Other features of gravity, with their own ``unknown_ratio`` and ``coupling_ratio``. If None, the sines for the
+        Other features of gravity, with their own ``inverse_length`` and ``coupling_ratio``. If None, the sines for the
         pendulum, cartpole and acrobot, and for other robots `LinkGravity` of all links whose features are not always 0.
     gravity_gain : float or array-like of shape (n_terms,) or (n_joints, n_terms), default=0.0
         Guess of the deceleration by gravity per unit of each feature: one for all, one per feature, or one per joint
@@ -215,15 +216,18 @@ class InertiaForceGravity(_NewtonFeatures):
     known_rate : float, default=0.3
         Prior standard deviation of the weights that Newton's law gives, as a rate in 1/s: the weight of a velocity for
         itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
-    unknown_ratio : float, default=3.0
-        Prior standard deviation of what an input contributes to the velocity of its own joint, and gravity to those of
-        the joints that it pulls, as a multiple of the change that the prior mean of all features leaves (see the Notes
-        of `InertiaForce`).
+    inverse_length : float, default=3.0
+        Prior standard deviation of 1/l in 1/m, with the effective length l of a pendulum that a link would be. Gravity
+        decelerates the joints that it pulls by g/l times a sine, or by 1/l times a feature of `LinkGravity`.
+    unknown_ratio : float, default=1.0
+        Prior standard deviation of what an input contributes to the velocity of its own joint, as a multiple of the
+        change that the prior mean of all features leaves (see the Notes of `InertiaForce`).
     coupling_ratio : float, default=0.3
-        The same for inputs and gravity at other joints, which act through the mass matrix. With 0 these weights stay 0.
+        The same for inputs and gravity at other joints, which act through the mass matrix, as a share of the standard
+        deviations above. With 0 these weights stay 0.
     other_ratio : float, default=0.003
-        The same for all other weights: those that are 0 in Newton's law, and the 1 of a position for itself. With 0
-        they stay at their mean.
+        Prior standard deviation of what all other features contribute, as a multiple of the same change. These weights
+        are 0 in Newton's law, or the 1 of a position for itself. With 0 they stay at their mean.
 
     Attributes
     ----------
@@ -287,6 +291,7 @@ class InertiaForceGravity(_NewtonFeatures):
         gravity_gain: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
         known_rate: float = 0.3,
+        inverse_length: float = 3.0,
         unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         other_ratio: float = 0.003,
@@ -298,6 +303,7 @@ class InertiaForceGravity(_NewtonFeatures):
         self.gravity_gain = gravity_gain
         self.outputs = outputs
         self.known_rate = known_rate
+        self.inverse_length = inverse_length
         self.unknown_ratio = unknown_ratio
         self.coupling_ratio = coupling_ratio
         self.other_ratio = other_ratio
@@ -306,6 +312,7 @@ class InertiaForceGravity(_NewtonFeatures):
         **_NewtonFeatures._parameter_constraints,
         "gravity": [LinkGravity, None],
         "gravity_gain": [Real, "array-like"],
+        "inverse_length": [Interval(Real, 0, None, closed="left")],
     }
 
     def _prepare(self, robot: Robot | None) -> None:
@@ -321,12 +328,12 @@ class InertiaForceGravity(_NewtonFeatures):
             if features.robot is None:
                 features.robot = robot
         elif robot is None or ((system := named_system(robot)) is not None and system.gravity):
-            features = SineGravity(robot, self.unknown_ratio, self.coupling_ratio)
+            features = SineGravity(robot, self.inverse_length, self.coupling_ratio)
         else:
             features = LinkGravity(
                 robot,
                 links=links_under_gravity(robot),
-                unknown_ratio=self.unknown_ratio,
+                inverse_length=self.inverse_length,
                 coupling_ratio=self.coupling_ratio,
             )
         return features.fit(np.zeros((1, n_columns)))

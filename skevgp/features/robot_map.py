@@ -370,9 +370,11 @@ class RobotMap(RobotTransformer):
         """
         layout = self._known_layout()
         rows = self._checked_states(layout, n_outputs)
-        labels = self._velocity_prior(layout).group
+        labels, mean = self._velocity_prior(layout).group, self._mean(layout, STEP)[: layout.n_joints]
+        if self._takes_steps():
+            mean = mean - (self._n_kept(layout) > 0) * np.eye(*mean.shape)  # of the state itself
         # Newton's law gives the weights of a position that are not 0.
-        of_positions = np.where(self._mean(layout, STEP)[: layout.n_joints] != 0.0, "known", labels)
+        of_positions = np.where(mean != 0.0, "known", labels)
         labels = self._with_kept(np.vstack([of_positions, labels]), layout, "")
         return labels[rows]
 
