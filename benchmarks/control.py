@@ -17,8 +17,8 @@ a tenth. iiwa14 learns from its moves of 50 steps, and is tested on slower ones 
 with 100 N on the cart and 2 N m on the pendulum, less than half of what holds it level. A run succeeds if the pole is
 within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG, or a Gaussian process of the change of
 state without physics, both with sines and cosines for the kernel, learned from short trajectories from random states.
-"Firm" is EVGP-IFG whose weights of states in states have a hundredth of the default prior scale: rough physics, but
-exact kinematics. Noise is a share of the states' scatter, in the data and in what the planner sees. "The truth" plans
+"Firm" is EVGP-IFG with the prior of the paper's setting, whose weights of states in states have a hundredth of its
+scale: rough physics, but exact kinematics. Noise is a share of the states' scatter, in the data and in what the planner sees. "The truth" plans
 on the simulated system.
 
 *tracking*: the iiwa14 of examples/computed_torque.py has a load and friction that its model does not know, and masses
@@ -52,7 +52,7 @@ from computed_torque import DT, ComputedTorque
 from harness import figure_of, text
 from paper.models import SIZES as PAPERS_SIZES
 from paper.models import SYSTEMS as PAPERS_SYSTEMS
-from paper.models import Fit, build, fitted_part, groups_of
+from paper.models import Fit, build, fitted_part, groups_of, papers_prior
 from skevgp import CoefPrior, EVGPRegressor, rollout
 from skevgp.datasets import load_robot, make_dynamics
 from skevgp.datasets.plant import Plant
@@ -300,12 +300,10 @@ class Truth:
 
 def firm(system: str) -> dict[str, np.ndarray]:
     """Return the prior of EVGP-IFG's weights with exact kinematics, as an argument of `EVGPRegressor`."""
-    n_joints = Plant(system).layout.n_joints
-    features = InertiaForceGravity(system, dt=mpc.DT).fit(np.zeros((1, 2 * n_joints + 1)))
-    mean, scale = features.coef_prior(2 * n_joints)
-    scale = np.array(scale)
-    scale[:, : 2 * n_joints] *= 0.01
-    return {"coef_prior": CoefPrior(mean=mean, scale=scale)}
+    n_states = 2 * Plant(system).layout.n_joints
+    scale = np.array(papers_prior(InertiaForceGravity(system, dt=mpc.DT), n_states).scale)
+    scale[:, :n_states] *= 0.01
+    return {"coef_prior": CoefPrior(scale=scale)}
 
 
 def run_swing_up(cell: SwingUp) -> dict[str, Any]:

@@ -89,6 +89,12 @@ def authors_start(fit: Fit, n_inducing: int, with_features: bool) -> dict[str, A
     }
 
 
+def papers_prior(features: TransformerMixin, n_outputs: int) -> CoefPrior:
+    """Return the prior of the paper's setting: weights that Newton's law gives ± 0.1, all others ± 1, per step."""
+    labels = features.coef_groups(n_outputs)
+    return CoefPrior(scale=np.where(labels == "known", 0.1, 1.0))
+
+
 def evgp(physics: type[TransformerMixin] | None, fit: Fit, n_inducing: int) -> EVGPRegressor:
     """Return an EVGP with features of inertia and force, with gravity too, or without features."""
     features = None if physics is None else physics(fit.system)
@@ -98,6 +104,8 @@ def evgp(physics: type[TransformerMixin] | None, fit: Fit, n_inducing: int) -> E
         features = make_union(features, NominalDynamics(wrong))
     elif fit.setting == "paper":
         arguments = PAPER
+        if features is not None:
+            arguments = {**PAPER, "coef_prior": papers_prior(features, 2 * layout_of(fit.system).n_joints)}
     elif fit.setting in AUTHORS_SCALE:
         arguments = authors_start(fit, n_inducing, features is not None)
     elif fit.setting == "skevgp-angles":
