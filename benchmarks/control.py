@@ -18,8 +18,8 @@ with 100 N on the cart and 2 N m on the pendulum, less than half of what holds i
 within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG, or a Gaussian process of the change of
 state without physics, both with sines and cosines for the kernel, learned from short trajectories from random states.
 "Firm" is EVGP-IFG with the prior of the paper's setting, whose weights of states in states have a hundredth of its
-scale: rough physics, but exact kinematics. Noise is a share of the states' scatter, in the data and in what the planner sees. "The truth" plans
-on the simulated system.
+scale: rough physics, but exact kinematics. Noise is a share of the states' scatter, in the data and in what the planner
+sees. "The truth" plans on the simulated system.
 
 *tracking*: the iiwa14 of examples/computed_torque.py has a load and friction that its model does not know, and masses
 that are 5 % off. All models learn from one log of a minute at 50 Hz, and are compared on references that were not in
