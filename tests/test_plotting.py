@@ -14,7 +14,13 @@ from sklearn.preprocessing import PolynomialFeatures
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
 from skevgp.metrics import prediction_error
-from skevgp.plotting import CoefficientDisplay, LearningCurveDisplay, PosteriorDisplay, RolloutDisplay
+from skevgp.plotting import (
+    CoefficientDisplay,
+    FeatureReportDisplay,
+    LearningCurveDisplay,
+    PosteriorDisplay,
+    RolloutDisplay,
+)
 
 mpl.use("Agg")
 X, y = make_toy(30, random_state=0, return_X_y=True)
@@ -151,6 +157,7 @@ def test_given_axes_are_used(trend, draw):
         CoefficientDisplay(["a"], *np.ones((4, 1))),
         LearningCurveDisplay(np.arange(3.0), np.ones((3, 2))),
         RolloutDisplay(np.arange(3.0), np.zeros((3, 2)), np.ones((3, 2))),
+        FeatureReportDisplay(["a"], np.zeros(1), np.ones(1), ["unclear"]),
     ],
     ids=lambda display: type(display).__name__,
 )

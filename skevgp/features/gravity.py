@@ -29,6 +29,7 @@ class GravityMap(RobotMap):
     """Features of gravity alone, with a prior that knows which joints each feature accelerates."""
 
     inverse_length: float
+    unknown_ratio: float
     coupling_ratio: float
     # What a weight is per 1/l: 1 for features in m/s².
     _per_length: ClassVar[float] = 1.0
@@ -36,6 +37,7 @@ class GravityMap(RobotMap):
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
         "inverse_length": [Interval(Real, 0, None, closed="left")],
+        "unknown_ratio": [Interval(Real, 0, None, closed="left")],
         "coupling_ratio": [Interval(Real, 0, None, closed="left")],
     }
 
@@ -58,8 +60,9 @@ class GravityMap(RobotMap):
         # Gravity decelerates a link by g / l times the sine of its angle.
         acts_on, rate = self._acts_on(layout), self._per_length * self.inverse_length
         prior = VelocityPrior.of(layout.n_joints, acts_on.shape[1], np.nan, "")
-        prior.set_rate(acts_on, rate, "gravity")
-        prior.set_rate(~acts_on, self.coupling_ratio * rate, "coupling")
+        ratio = self.unknown_ratio
+        prior.set_rate(acts_on, rate, "gravity", ratio)
+        prior.set_rate(~acts_on, self.coupling_ratio * rate, "coupling", self.coupling_ratio * ratio)
         return prior
 
 
@@ -68,10 +71,11 @@ class SineGravity(GravityMap):
 
     _per_length: ClassVar[float] = GRAVITY
 
-    def __init__(self, robot: Robot | None, inverse_length: float, coupling_ratio: float):
+    def __init__(self, robot: Robot | None, inverse_length: float, unknown_ratio: float, coupling_ratio: float):
         self.robot = robot
         self.outputs = None
         self.inverse_length = inverse_length
+        self.unknown_ratio = unknown_ratio
         self.coupling_ratio = coupling_ratio
 
     def _terms(self) -> Sequence[GravityTerm]:
@@ -142,6 +146,9 @@ class LinkGravity(GravityMap):
     inverse_length : float, default=3.0
         Prior standard deviation of 1/l in 1/m, with the effective length l of a pendulum that the link would be. The
         weights for the velocities of the joints between the base and the link are Δt times 1/l.
+    unknown_ratio : float, default=1.0
+        Largest prior standard deviation of what a feature contributes, as a multiple of the change of the velocity that
+        the prior mean of all features leaves. Motors that hold an arm leave little of gravity to see.
     coupling_ratio : float, default=0.3
         The same for the velocities of other joints, which the pull moves through the mass matrix, as a share of that.
         With 0 these weights stay 0.
@@ -201,6 +208,7 @@ class LinkGravity(GravityMap):
         links: Sequence[int | str] | None = None,
         outputs: Sequence[int | str] | None = None,
         inverse_length: float = 3.0,
+        unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         dt: Literal["column"] | None = None,
     ):
@@ -209,6 +217,7 @@ class LinkGravity(GravityMap):
         self.links = links
         self.outputs = outputs
         self.inverse_length = inverse_length
+        self.unknown_ratio = unknown_ratio
         self.coupling_ratio = coupling_ratio
         self.dt = dt
 

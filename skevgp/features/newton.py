@@ -328,12 +328,13 @@ class InertiaForceGravity(_NewtonFeatures):
             if features.robot is None:
                 features.robot = robot
         elif robot is None or ((system := named_system(robot)) is not None and system.gravity):
-            features = SineGravity(robot, self.inverse_length, self.coupling_ratio)
+            features = SineGravity(robot, self.inverse_length, self.unknown_ratio, self.coupling_ratio)
         else:
             features = LinkGravity(
                 robot,
                 links=links_under_gravity(robot),
                 inverse_length=self.inverse_length,
+                unknown_ratio=self.unknown_ratio,
                 coupling_ratio=self.coupling_ratio,
             )
         return features.fit(np.zeros((1, n_columns)))

@@ -252,7 +252,8 @@ class VelocityPrior(NamedTuple):
 
     # Of the weight divided by Δt. NaN: in units of the data.
     rate: np.ndarray
-    # In units of the data: multiples of rms(y - h(x)ᵀμ) / rms of the feature. NaN: ``rate`` holds.
+    # In units of the data: multiples of rms(y - h(x)ᵀμ) / rms of the feature. NaN: ``rate`` holds. If there are both,
+    # the smaller standard deviation holds.
     ratio: np.ndarray
     # The label of the group.
     group: np.ndarray
@@ -267,9 +268,9 @@ class VelocityPrior(NamedTuple):
         """Put some weights into another group, in units of the data."""
         self.rate[where], self.ratio[where], self.group[where] = np.nan, ratio, group
 
-    def set_rate(self, where: Any, rate: float, group: str) -> None:
-        """Put some weights into another group, with a standard deviation of their own."""
-        self.rate[where], self.ratio[where], self.group[where] = rate, np.nan, group
+    def set_rate(self, where: Any, rate: float, group: str, ratio: float = np.nan) -> None:
+        """Put some weights into another group, with a standard deviation of their own, or at most so much."""
+        self.rate[where], self.ratio[where], self.group[where] = rate, ratio, group
 
     def beside(self, other: VelocityPrior) -> VelocityPrior:
         """The prior of these features and further ones."""
@@ -313,7 +314,8 @@ class RobotMap(RobotTransformer):
         """
         self._validate_params()
         layout = self._known_layout()
-        rows, scale = self._checked_states(layout, n_outputs), self._velocity_prior(layout).rate
+        rows, prior = self._checked_states(layout, n_outputs), self._velocity_prior(layout)
+        scale = np.where(np.isnan(prior.ratio), prior.rate, np.nan)
         dt = self._typical_step() or STEP
         mean = self._mean(layout, dt)
         # A velocity that is wrong by some amount moves its position by Δt times that.
@@ -345,13 +347,20 @@ class RobotMap(RobotTransformer):
         layout = self._known_layout()
         left_over = np.asarray(left_over, dtype=float)
         rows, n = self._checked_states(layout, len(left_over)), layout.n_joints
-        ratio = self._with_kept(self._velocity_prior(layout).ratio, layout, np.nan)
+        prior = self._velocity_prior(layout)
+        ratio, rate = (self._with_kept(values, layout, np.nan) for values in (prior.ratio, prior.rate))
         found = dict(zip(rows, left_over, strict=True))
         step = self._typical_step()
         change = [
             step * found[row + n] if step is not None and row < n and row + n in found else found[row] for row in rows
         ]
-        return ratio[[row % n for row in rows]] * np.array(change)[:, np.newaxis] / np.asarray(size, dtype=float)
+        joints = [row % n for row in rows]
+        scale = ratio[joints] * np.array(change)[:, np.newaxis] / np.asarray(size, dtype=float)
+        if step is None:
+            return scale
+        per_step = np.array([step if row < n else 1.0 for row in rows])[:, np.newaxis]
+        per_step = per_step if self._takes_steps() else step * per_step
+        return np.fmin(scale, np.where(np.isnan(ratio[joints]), np.nan, per_step * rate[joints]))
 
     @available_if(has_robot)
     def coef_groups(self, n_outputs: int) -> np.ndarray:

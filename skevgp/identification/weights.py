@@ -19,6 +19,8 @@ _TRIAL_ROUNDS, _ROUNDS, _SETTLED = 4, 12, 0.02
 _FIRST_NOISE = (1.0, 1e-5)
 # Smaller eigenvalues of a precision with unit diagonal are rounding errors.
 _SINGULAR = 1e-15
+# Largest logarithm of a factor of a group's scale, up or down.
+_WIDEST = np.log(1e4)
 # Least noise, as a share of an output's variance.
 _LEAST = 1e-12
 
@@ -234,10 +236,12 @@ class _Problem:
             if group:
                 own = self.prior.groups == group
                 n, total = own.sum(), squares[own].sum() * factors[own][0] ** 2
-                # -n + total / t² - log t falls with t. Its zero is between 1 and √(total / n).
-                ends = sorted([0.0, 0.5 * np.log(max(total, np.finfo(float).tiny) / n)])
-                if ends[0] < ends[1]:
-                    factors[own] = np.exp(brentq(lambda log: total * np.exp(-2.0 * log) - n - log, *ends))  # noqa: B023
+                # -n + total / t² - log t falls with log t. It is 0 at the best t, or beyond the limits of t.
+                low, high = (total * np.exp(-2.0 * edge) - n - edge for edge in (-_WIDEST, _WIDEST))
+                best = -_WIDEST if low <= 0.0 else _WIDEST
+                if low > 0.0 > high:
+                    best = brentq(lambda log: total * np.exp(-2.0 * log) - n - log, -_WIDEST, _WIDEST)  # noqa: B023
+                factors[own] = np.exp(best)
         return factors
 
     def whitened(self, state: _State) -> tuple[np.ndarray, np.ndarray]:

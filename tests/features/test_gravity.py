@@ -133,6 +133,8 @@ def test_link_named_twice_raises(links):
         ({"axes": ["x"]}, "'axes' parameter"),
         ({"links": "q2"}, "'links' parameter .* Got 'q2'"),
         ({"links": 2}, "'links' parameter .* Got 2"),
+        ({"inverse_length": -1.0}, "'inverse_length' parameter .* Got -1.0"),
+        ({"inverse_length": np.inf}, "'inverse_length' parameter .* Got inf"),
         ({"unknown_ratio": -1.0}, "'unknown_ratio' parameter .* Got -1.0"),
         ({"coupling_ratio": np.nan}, "'coupling_ratio' parameter .* Got nan"),
     ],
@@ -166,7 +168,9 @@ def test_names_say_link_and_lever():
 
 @pytest.mark.parametrize("fitted", [False, True])
 def test_prior_knows_which_joints_bear_a_link(fitted):
-    features = LinkGravity("iiwa14", axes="x", links=["q1", "q3", "q7"], unknown_ratio=2.0, coupling_ratio=0.5)
+    """A weight for a velocity is Δt / l, with Δt = 0.03 s if it is not known, or less if the data leave less."""
+    prior = {"inverse_length": 2.0, "unknown_ratio": 5.0, "coupling_ratio": 0.5}
+    features = LinkGravity("iiwa14", axes="x", links=["q1", "q3", "q7"], **prior)
     if fitted:
         features.fit(rows("iiwa14"))
     mean, own = features.coef_prior(14)
@@ -174,16 +178,32 @@ def test_prior_knows_which_joints_bear_a_link(fitted):
     assert np.isnan(own).all()
     borne = np.arange(7)[:, np.newaxis] < [1, 3, 7]
     assert_array_equal(features.coef_groups(14), np.tile(np.where(borne, "gravity", "coupling"), (2, 1)))
-    left_over, size = np.arange(1.0, 15.0), np.array([1.0, 2.0, 4.0])
-    expected = np.tile(np.where(borne, 2.0, 0.5), (2, 1)) * left_over[:, np.newaxis] / size
-    assert_allclose(features.coef_scale(left_over, size), expected)
+    share, size = np.where(borne, 1.0, 0.5), np.array([1.0, 2.0, 4.0])
+    largest = np.vstack([0.03**2 * 2.0 * share, 0.03 * 2.0 * share])
+    assert_allclose(features.coef_scale(np.full(14, 1e3), size), largest, rtol=1e-14)
+    left_over = 1e-5 * np.arange(1.0, 15.0)
+    in_units = np.tile(5.0 * share, (2, 1)) * left_over[:, np.newaxis] / size
+    assert_allclose(features.coef_scale(left_over, size), in_units, rtol=1e-14)
+
+
+@pytest.mark.parametrize("length", [0.1, 2.0])
+def test_weight_of_a_point_mass_is_one_over_its_length(length):
+    """Then a standard deviation of 1 / l is one of 100 % of the deceleration."""
+    link = Link("q", "revolute", (0.0, 1.0, 0.0), mass=3.0, com=(0.0, 0.0, -length))
+    system, X = System("simple", links=(link,)), rows("pendulum")
+    model, still = load_robot(system), np.zeros(1)
+    acceleration = [pinocchio.aba(model, model.createData(), x[:1], still, still)[0] for x in X]
+    features = LinkGravity(system, axes="x", inverse_length=1.0 / length)
+    scale = features.coef_scale(np.full(2, 1e3), np.ones(1))
+    assert_allclose(-features.fit_transform(X)[:, 0] * scale[1] / 0.03, acceleration)
 
 
 def test_outputs_choose_states():
-    features = LinkGravity("acrobot", outputs=["dq1/dt", "q2"], unknown_ratio=2.0, coupling_ratio=0.0)
+    features = LinkGravity("acrobot", outputs=["dq1/dt", "q2"], inverse_length=2.0, coupling_ratio=0.0)
     mean, _ = features.coef_prior(2)
     assert_array_equal(mean, np.zeros((2, 4)))
-    assert_array_equal(features.coef_scale([1.0, 10.0], np.ones(4)), [[2, 2, 2, 2], [0, 0, 20, 20]])
+    scale = features.coef_scale(np.full(2, 1e3), np.ones(4))
+    assert_allclose(scale, [[0.06, 0.06, 0.06, 0.06], [0.0, 0.0, 0.0018, 0.0018]], rtol=1e-14)
 
 
 def test_union_is_inertia_force_gravity_in_two_parts():
@@ -192,9 +212,7 @@ def test_union_is_inertia_force_gravity_in_two_parts():
     union, whole = FeatureUnion([("if", inertia), ("g", levers)]), InertiaForceGravity("iiwa14", other_ratio=1.0)
     H = whole.fit_transform(X)
     assert_array_equal(union.fit_transform(X), H)
-    # `LinkGravity` does not know Δt. What is left of a position counts as Δt times what is left of its velocity.
-    left = np.random.default_rng(1).normal(size=(60, 7))
-    y = H @ whole.coef_prior(14)[0].T + np.hstack([0.03 * left, left])
+    y = np.random.default_rng(1).normal(size=(60, 14))
     of_union, of_whole = (EVGPRegressor(features, n_inducing=5, max_iter=0).fit(X, y) for features in (union, whole))
     assert_array_equal(of_union.coef_prior_mean_, of_whole.coef_prior_mean_)
     assert_allclose(of_union.coef_prior_scale_, of_whole.coef_prior_scale_, rtol=1e-12)

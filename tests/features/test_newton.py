@@ -40,6 +40,7 @@ GROUPS = {
 }
 NAMES = {"k": "known", "i": "input", "g": "gravity", "c": "coupling", ".": "other"}
 PRIOR = {"known_rate": 0.7, "unknown_ratio": 5.0, "coupling_ratio": 0.5, "other_ratio": 0.02}
+LENGTH = {"inverse_length": 4.0}
 
 
 def rows(name, n_rows=5):
@@ -87,30 +88,37 @@ def test_without_guesses_only_eulers_rule_is_known(name):
     assert_array_equal(mean[:, 2 * n :], 0.0)
 
 
+@pytest.mark.parametrize("left", [1e-3, 1e3])
 @pytest.mark.parametrize("name", COLUMNS)
-def test_standard_deviations_are_those_of_their_groups(name):
-    """Of the known weights in 1/s, of all others in units of the data; Δt times those of the velocity for positions."""
+def test_standard_deviations_are_those_of_their_groups(name, left):
+    """Rates of weights that Newton's law gives, and of gravity at most; all others are in units of the data."""
     n, of_velocities = layout_of(name).n_joints, np.array([list(row) for row in GROUPS[name]])
-    features = InertiaForceGravity(name, dt=DT, **PRIOR)
+    features = InertiaForceGravity(name, dt=DT, **LENGTH, **PRIOR)
     # Newton's law gives the 1 of a position for itself, too. Its group is that of the known ones.
     of_positions = np.where(np.eye(*of_velocities.shape), "k", of_velocities)
     groups = np.vectorize(NAMES.get)(np.vstack([of_positions, of_velocities]))
     assert_array_equal(features.coef_groups(2 * n), groups)
-    known = of_velocities == "k"
+    n_inertia = 2 * n + layout_of(name).n_inputs
+    # A sine decelerates by g / l, and moves other joints by a share of that.
+    rate = np.vectorize({"k": 0.7, "g": 9.81 * 4.0, "c": 0.5 * 9.81 * 4.0}.get)(of_velocities, np.nan)
+    rate[:, 2 * n : n_inertia] = np.nan
+    ratio = np.vectorize({"i": 5.0, "g": 5.0, "c": 0.5 * 5.0, ".": 0.02}.get)(of_velocities, np.nan)
     _, own = features.coef_prior(2 * n)
-    assert_allclose(own[n:], np.where(known, DT * 0.7, np.nan))
+    assert_allclose(own[n:], DT * np.where(np.isnan(ratio), rate, np.nan))
     rng = np.random.default_rng(0)
-    left_over, size = rng.uniform(1.0, 2.0, 2 * n), rng.uniform(1.0, 2.0, known.shape[1])
+    left_over, size = left * rng.uniform(1.0, 2.0, 2 * n), rng.uniform(1.0, 2.0, rate.shape[1])
     in_units = features.coef_scale(left_over, size)
-    ratio = np.vectorize({"k": np.nan, "i": 5.0, "g": 5.0, "c": 0.5, ".": 0.02}.get)(of_velocities)
-    assert_allclose(in_units[n:], ratio * left_over[n:, np.newaxis] / size)
+    expected = ratio * left_over[n:, np.newaxis] / size
+    expected[:, n_inertia:] = np.minimum(expected, DT * rate)[:, n_inertia:]
+    assert_allclose(in_units[n:], expected)
+    # A position changes by Δt times its velocity.
     assert_allclose(own[:n], DT * own[n:])
     assert_allclose(in_units[:n], DT * in_units[n:])
     # Without gravity they are the same.
     inertia = InertiaForce(name, dt=DT, **PRIOR)
-    assert_array_equal(inertia.coef_groups(2 * n), groups[:, : 2 * n + 1])
-    assert_array_equal(inertia.coef_prior(2 * n)[1], own[:, : 2 * n + 1])
-    assert_array_equal(inertia.coef_scale(left_over, size[: 2 * n + 1]), in_units[:, : 2 * n + 1])
+    assert_array_equal(inertia.coef_groups(2 * n), groups[:, :n_inertia])
+    assert_array_equal(inertia.coef_prior(2 * n)[1], own[:, :n_inertia])
+    assert_array_equal(inertia.coef_scale(left_over, size[:n_inertia]), in_units[:, :n_inertia])
 
 
 def test_ratios_of_zero_pin_the_zeros():
@@ -161,6 +169,7 @@ def test_target_of_another_width_raises(outputs, n_outputs, message):
         ({"dt": np.nan}, "'dt' parameter .* Got nan"),
         ({"known_rate": -1.0}, "'known_rate' parameter .* Got -1.0"),
         ({"unknown_ratio": np.inf}, "'unknown_ratio' parameter .* Got inf"),
+        ({"inverse_length": -1.0}, "'inverse_length' parameter .* Got -1.0"),
         ({"coupling_ratio": np.nan}, "'coupling_ratio' parameter .* Got nan"),
         ({"other_ratio": -0.1}, "'other_ratio' parameter .* Got -0.1"),
         ({"inverse_inertia": [1.0, 2.0]}, "inverse_inertia must be a finite number or 1 of them"),
@@ -233,7 +242,8 @@ def test_without_gravity_nothing_is_added():
 
 @pytest.mark.parametrize("fitted", [False, True])
 def test_prior_of_an_arm_is_eulers_rule_and_gravity_on_the_joints_below_each_link(fitted):
-    features, inertia = InertiaForceGravity("iiwa14", gravity_gain=2.0, **PRIOR), InertiaForce("iiwa14", **PRIOR)
+    inertia = InertiaForce("iiwa14", dt=DT, **PRIOR)
+    features = InertiaForceGravity("iiwa14", dt=DT, gravity_gain=2.0, **LENGTH, **PRIOR)
     if fitted:
         features.fit(arm_rows())
     mean, own = features.coef_prior(14)
@@ -245,10 +255,12 @@ def test_prior_of_an_arm_is_eulers_rule_and_gravity_on_the_joints_below_each_lin
     borne = np.zeros((7, 12), dtype=bool)
     for column, link in enumerate(np.repeat(range(2, 8), 2)):
         borne[:link, column] = True
-    assert_array_equal(mean[:, 21:], np.vstack([np.zeros((7, 12)), np.where(borne, -0.06, 0.0)]))
+    assert_array_equal(mean[:, 21:], np.vstack([np.zeros((7, 12)), np.where(borne, -DT * 2.0, 0.0)]))
     assert_array_equal(groups[:, 21:], np.tile(np.where(borne, "gravity", "coupling"), (2, 1)))
-    assert_array_equal(in_units[7:, 21:], np.where(borne, 5.0, 0.5))
-    assert_allclose(in_units[:7], 0.03 * in_units[7:])
+    # The levers are in m/s²: their weights are Δt / l, which is less than the data leave.
+    assert_allclose(in_units[7:, 21:], DT * np.where(borne, 4.0, 0.5 * 4.0))
+    assert_allclose(in_units[:7], DT * in_units[7:])
+    assert np.isnan(own[:, 21:]).all()
 
 
 def test_there_may_be_a_guess_per_lever():
@@ -257,15 +269,31 @@ def test_there_may_be_a_guess_per_lever():
     assert_allclose(mean[7, 21:], -0.03 * gain)
 
 
-def test_levers_can_be_asked_for_and_have_their_own_ratios():
-    levers = LinkGravity(axes="x", unknown_ratio=5.0, coupling_ratio=0.0)
-    features = InertiaForceGravity("acrobot", gravity=levers).fit(rows("acrobot"))
+def test_levers_can_be_asked_for_and_have_their_own_prior():
+    levers = LinkGravity(axes="x", inverse_length=5.0, unknown_ratio=2.0, coupling_ratio=0.0)
+    features = InertiaForceGravity("acrobot", dt=DT, gravity=levers, **LENGTH, **PRIOR).fit(rows("acrobot"))
     assert features.get_feature_names_out().tolist() == [*COLUMNS["acrobot"], "gravity(q1, u_x)", "gravity(q2, u_x)"]
     assert_allclose(
         features.transform(rows("acrobot"))[:, 5:], 9.81 * np.sin(np.cumsum(rows("acrobot")[:, :2], axis=1))
     )
-    assert_array_equal(features.coef_scale(np.ones(4), np.ones(7))[2:, 5:], [[5, 5], [0, 5]])
+    assert_allclose(features.coef_scale(np.full(4, 1e3), np.ones(7))[2:, 5:], DT * np.array([[5, 5], [0, 5]]))
+    assert_allclose(features.coef_scale(np.full(4, 1e-3), np.ones(7))[2:, 5:], 1e-3 * np.array([[2, 2], [0, 2]]))
     assert levers.robot is None  # the user's own is not touched
+
+
+@pytest.mark.parametrize("left", [1e-3, 1e3])
+def test_sines_and_levers_have_the_same_prior(left):
+    """A lever is g times the sine, and its weight 1 / g times that of the sine."""
+    X, gravity = rows("acrobot"), {"inverse_length": 4.0, "unknown_ratio": 5.0, "coupling_ratio": 0.5}
+    contributions = []
+    for given in (None, LinkGravity(axes="x", **gravity)):
+        features = InertiaForceGravity("acrobot", gravity=given, **gravity)
+        H = features.fit_transform(X)
+        scale = features.coef_scale(np.full(4, left), np.sqrt(np.mean(H**2, axis=0)))
+        contributions.append(H[:, 5:] * scale[:, np.newaxis, 5:])
+    sines, levers = contributions
+    assert_allclose(levers, sines)
+    assert (sines != 0.0).all()
 
 
 def test_levers_of_another_robot_must_fit():

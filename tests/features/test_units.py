@@ -1,4 +1,4 @@
-"""The prior of weights for velocities knows no unit of length, angle or force, and no time step."""
+"""The prior of inertia and force knows no unit of length, angle or force, and that of a rate no time step."""
 
 import numpy as np
 import pytest
