@@ -30,7 +30,7 @@ def test_toy_and_the_pendulum_run():
 def test_any_robot_runs():
     """With fewer moves."""
     names = {}
-    exec(SNIPPETS[2].replace('"ur5", 60', '"ur5", 10').replace("n_inducing=30", "n_inducing=5"), names)
+    exec(SNIPPETS[2].replace('"ur5", 60', '"ur5", 10').replace("n_inducing=30", "n_inducing=10"), names)
     assert names["train"].data.shape == (500, 18)
     assert names["model"].score(names["train"].data, names["train"].target) > 0.99
 

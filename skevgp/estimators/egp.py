@@ -105,7 +105,8 @@ class EGPRegressor(GaussianProcess):
         Log marginal likelihood in nats, summed over outputs. With k vague weights it is that of n_samples - k contrasts
         (Rasmussen & Williams 2006, eq. 2.45).
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the log marginal likelihood per iteration.
+        Minus the log marginal likelihood per iteration. With learned scales of weights, it includes minus the log
+        prior density of their factors, ½ Σ log² t.
     n_iter_ : int
         Number of iterations of the best start, or of evaluations of a callable ``optimizer``.
     n_features_in_ : int

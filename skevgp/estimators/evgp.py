@@ -135,7 +135,8 @@ class EVGPRegressor(GaussianProcess):
         Bounds on the log marginal likelihood at the fitted parameters, in nats, summed over outputs. If they agree,
         more inducing points cannot improve the fit. The upper bound (Titsias 2014) is loose with many rows.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the lower bound per iteration; for Adam, minus its estimate by a mini-batch.
+        Minus the lower bound per iteration; for Adam, minus its estimate by a mini-batch. With learned scales of
+        weights, it includes minus the log prior density of their factors, ½ Σ log² t.
     n_iter_ : int
         Number of iterations of the best start.
     n_parameters_ : int

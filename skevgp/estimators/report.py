@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import norm, wilcoxon
 from sklearn.base import clone
 from sklearn.model_selection import GroupKFold, KFold
-from sklearn.utils import check_random_state
+from sklearn.utils import check_consistent_length, check_random_state
 
 from ..exceptions import ignored
 from ..fitting.prior import CoefPrior
@@ -67,12 +67,26 @@ class FeatureReport:
 
     ``print`` shows it as text, and a notebook as a table.
 
-    Attributes
+    Parameters
     ----------
     groups : tuple of FeatureGroup
         One for each group of weights, and one for all features together.
     held_out : str
         What was held out: "trajectories", "rows" or "" (nothing).
+
+    See Also
+    --------
+    feature_report : Compute a report.
+
+    Examples
+    --------
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import EVGPRegressor, feature_report
+    >>> from skevgp.datasets import make_toy
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
+    >>> print(feature_report(model).groups[0])
+    features: pass X and y to see whether the features help.
     """
 
     groups: tuple[FeatureGroup, ...]
@@ -160,6 +174,8 @@ def feature_report(
     ------
     NotFittedError
         If the model is not fitted.
+    TypeError
+        If the model is another regressor.
     ValueError
         If the model has no features, or there are fewer groups than folds.
 
@@ -174,25 +190,24 @@ def feature_report(
     mean over held-out trajectories of the log density per row, summed over outputs, with the group minus without. Its
     standard error is that of the mean over trajectories, or over rows without ``groups``. The group helps or hurts if
     the losses differ from 0 by Wilcoxon's signed-rank test at the level 0.05, and by 0.01 nats. Otherwise it does
-    nothing if the mean loss is within 0.05 nats of 0 by two standard errors, and the verdict is "unclear" if not. The
-    test needs at least six trajectories.
+    nothing if the mean loss is within 0.05 nats of 0 by two standard errors, and the verdict is "unclear" if not, or
+    if mean and median of the losses have different signs. The test needs at least six trajectories. Rows have weight 1.
 
     Examples
     --------
     >>> from skevgp import EVGPRegressor, feature_report
     >>> from skevgp.datasets import make_dynamics
     >>> from skevgp.features import InertiaForceGravity
-    >>> data = make_dynamics("pendulum", 6, 25, noise=0.01, random_state=0)
-    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
-    >>> model.fit(data.data, data.target, groups=data.groups)
-    EVGPRegressor(...)
+    >>> data = make_dynamics("pendulum", 20, 25, noise=0.01, random_state=1)
+    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=20, random_state=0)
+    >>> model = model.fit(data.data, data.target, groups=data.groups)
     >>> report = feature_report(model, data.data, data.target, groups=data.groups)
-    >>> [one.group for one in report.groups]
-    ['other', 'known', 'input', 'gravity', 'all features']
-    >>> report.groups[-1].verdict
+    >>> {one.group: one.verdict for one in report.groups}["all features"]
     'helps'
     """
     check_fitted(model)
+    if not isinstance(model, GaussianProcess):
+        raise TypeError(f"feature_report needs an EVGPRegressor or EGPRegressor; got {model!r}.")
     if not hasattr(model, "coef_"):
         raise ValueError("The model has no features: it was fitted with feature_map=None.")
     check_integer(n_splits, "n_splits", minimum=2)
@@ -208,6 +223,7 @@ def feature_report(
         return FeatureReport(tuple(found), "")
     if y is None:
         raise ValueError("feature_report needs y with X.")
+    check_consistent_length(X, y)
     target = np.asarray(y)
     names_of_rows = checked_groups(groups, len(target))
     if names_of_rows is None:
@@ -236,8 +252,10 @@ def feature_report(
 
 def _verdict(losses: np.ndarray, loss: float, error: float) -> str:
     """Return what held-out losses (n,), their mean and its standard error say of a group."""
-    if losses.any() and abs(loss) > _LEAST and wilcoxon(losses).pvalue < _CHANCE:
-        return "helps" if np.median(losses) > 0.0 else "hurts"
+    middle = float(np.median(losses))
+    # A few rows may outweigh all others.
+    if abs(loss) > _LEAST and middle * loss > 0.0 and wilcoxon(losses).pvalue < _CHANCE:
+        return "helps" if loss > 0.0 else "hurts"
     return "does nothing" if abs(loss) + 2.0 * error < 5.0 * _LEAST else "unclear"
 
 
@@ -250,7 +268,9 @@ def _of_weights(model: Any, name: str, mask: np.ndarray) -> FeatureGroup:
     given = model._fitted.units.prior.scale[: len(mask)][mask]
     free = (prior_std > 0.0) & np.isfinite(prior_std)
     if not free.any():
-        return FeatureGroup(name, int(mask.sum()), 1.0, 0.0, 1.0)
+        # Weights that are fixed, or have no prior.
+        ratio = 0.0 if np.isinf(prior_std).any() else 1.0
+        return FeatureGroup(name, int(mask.sum()), 1.0, np.nan, ratio)
     mean, std, prior_mean, prior_std, given = (own[free] for own in (mean, std, prior_mean, prior_std, given))
     return FeatureGroup(
         name,
@@ -266,7 +286,8 @@ def _without(model: Any, prior: Any, mask: np.ndarray | None, labels: np.ndarray
     out = np.zeros(labels.shape, dtype=bool) if mask is None else mask
     first = 0 if prior.shared else slice(None)
     groups = None if prior.groups is None else model.coef_groups_
-    mean, scale = np.where(out, 0.0, prior.mean)[first], np.where(out, 0.0, prior.scale)[first]
+    scale = np.where(np.isinf(np.atleast_2d(model.coef_prior_scale_)), np.inf, prior.scale)
+    mean, scale = np.where(out, 0.0, prior.mean)[first], np.where(out, 0.0, scale)[first]
     if prior.root is None:
         own = CoefPrior(mean, scale, shared=prior.shared, groups=groups)
     else:
@@ -288,7 +309,8 @@ def _held_out(
         mean, std = model.predict(safe_indexing(X, test), return_std=True)
     bound = getattr(model, "lower_bound_", None)
     bound = model.log_marginal_likelihood_value_ if bound is None else bound
-    density = norm.logpdf(y[test], mean, std).reshape(len(test), -1).sum(axis=1)
+    each = norm.logpdf(y[test].reshape(mean.shape), mean, std)
+    density = each.reshape(len(test), -1).sum(axis=1)
     if labels is not None:
         density = np.array([density[labels[test] == label].mean() for label in np.unique(labels[test])])
     return bound / len(train), density

@@ -152,9 +152,10 @@ class LinkGravity(GravityMap):
     coupling_ratio : float, default=0.3
         The same for the velocities of other joints, which the pull moves through the mass matrix, as a share of that.
         With 0 these weights stay 0.
-    dt : "column" or None, default=None
-        If ``"column"``, X has a last column, the time step Δt of each row in seconds, and features are multiplied by
-        it. Weights are then rates (1/m for a lever).
+    dt : float, "column" or None, default=None
+        Time step Δt of the data in s, which only the prior needs. If None, it is not known: 0.03 s limits the pull, and
+        positions do not follow from velocities. If ``"column"``, X has a last column, the time step of each row, and
+        features are multiplied by it. Weights are then rates (1/m for a lever).
 
     Attributes
     ----------
@@ -210,7 +211,7 @@ class LinkGravity(GravityMap):
         inverse_length: float = 3.0,
         unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
-        dt: Literal["column"] | None = None,
+        dt: float | Literal["column"] | None = None,
     ):
         self.robot = robot
         self.axes = axes
@@ -225,7 +226,7 @@ class LinkGravity(GravityMap):
         **GravityMap._parameter_constraints,
         "axes": [StrOptions({"xy", "x"})],
         "links": ["array-like", None],
-        "dt": [StrOptions({"column"}), None],
+        "dt": [Interval(Real, 0, None, closed="neither"), StrOptions({"column"}), None],
     }
 
     def _prepare(self, robot: Robot | None) -> None:

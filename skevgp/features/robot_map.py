@@ -356,10 +356,9 @@ class RobotMap(RobotTransformer):
         ]
         joints = [row % n for row in rows]
         scale = ratio[joints] * np.array(change)[:, np.newaxis] / np.asarray(size, dtype=float)
-        if step is None:
-            return scale
-        per_step = np.array([step if row < n else 1.0 for row in rows])[:, np.newaxis]
-        per_step = per_step if self._takes_steps() else step * per_step
+        dt = step or STEP
+        per_step = np.array([dt if row < n else 1.0 for row in rows])[:, np.newaxis]
+        per_step = per_step if self._takes_steps() else dt * per_step
         return np.fmin(scale, np.where(np.isnan(ratio[joints]), np.nan, per_step * rate[joints]))
 
     @available_if(has_robot)
