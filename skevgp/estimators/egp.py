@@ -94,7 +94,9 @@ class EGPRegressor(GaussianProcess):
     coef_names_ : ndarray of str of shape (n_h,)
         Names of the features by ``get_feature_names_out`` of the feature map, or h0, h1, ...
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        Prior means and standard deviations of the weights.
+        Prior means and standard deviations of the weights. The latter are learned (see `CoefPrior`).
+    coef_groups_ : ndarray of str of the shape of ``coef_``
+        Label of the group of each weight, or empty if its prior standard deviation is not learned.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     kernel_ : Kernel, or list of Kernel for several outputs
