@@ -90,7 +90,9 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
             f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
             "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."
         )
-    if (np.abs(prior.reference) > _FAR_WEIGHT).any():
+    # Weights with a learned scale are as far as their scale allows.
+    fixed = True if prior.groups is None else prior.groups < 0
+    if ((np.abs(prior.reference) > _FAR_WEIGHT) & fixed).any():
         return (
             f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
             "raise the scale of coef_prior or, if it is an intercept's, set normalize_y=True."
