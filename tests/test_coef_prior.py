@@ -301,3 +301,29 @@ def test_root_of_a_covariance_has_nothing_between_groups():
     root = resolve(FunctionTransformer(), cov=COVARIANCE, groups=groups).root
     assert_allclose(root @ root.transpose(0, 2, 1), [COVARIANCE] * 2, atol=1e-14)
     assert not root[:, groups[:, np.newaxis] != groups].any()
+
+
+class LabelledOnly(TransformerMixin, BaseEstimator):
+    """The identity, which knows the groups of its weights and nothing else."""
+
+    def fit(self, X, y=None):
+        return self
+
+    def transform(self, X):
+        return X
+
+    def coef_groups(self, n_outputs):
+        return np.array([["a", "b", ""]] * n_outputs, dtype=object)
+
+
+def test_map_may_know_groups_only():
+    found = resolve(LabelledOnly())
+    assert found.groups.tolist() == [["a", "b", ""]] * 2
+    assert_array_equal(found.mean, np.zeros((2, 3)))
+
+
+def test_no_label_is_none_and_others_are_words():
+    found = resolve(LabelledOnly(), groups=np.array(["a", None, ""], dtype=object))
+    assert found.groups.tolist() == [["a", "", ""]] * 2
+    with pytest.raises(ValueError, match="groups of CoefPrior must be words"):
+        resolve(LabelledOnly(), groups=[1.0, 2.0, np.nan])

@@ -20,7 +20,7 @@ from ..data.dataset import Dataset, checked_numbers, checked_rows
 from ..exceptions import warn_user
 from ..fitting.exact import ExactFit
 from ..fitting.fit import Fitted
-from ..fitting.prior import CoefPrior, coef_names
+from ..fitting.prior import CoefPrior, as_coef_prior, coef_names
 from ..fitting.problem import Problem
 from ..kernels.parse import KernelSpec
 from ..noise import as_noise
@@ -217,7 +217,9 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return bundle
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters. With ``solver__...`` or ``noise__...``, a solver or noise that is a string becomes an object.
+        """Set parameters. With ``solver__...``, a solver that is a string becomes an object.
+
+        So do a noise and a prior of the weights.
 
         Parameters
         ----------
@@ -229,7 +231,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         self : object
             The estimator itself.
         """
-        for name, as_object in (("solver", as_solver), ("noise", as_noise)):
+        for name, as_object in (("solver", as_solver), ("noise", as_noise), ("coef_prior", as_coef_prior)):
             value = params.get(name, getattr(self, name, None))
             if isinstance(value, str) and any(key.startswith(f"{name}__") for key in params):
                 params[name] = as_object(value)

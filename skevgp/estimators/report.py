@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
-from scipy.stats import norm, wilcoxon
+from scipy.stats import norm, t, wilcoxon
 from sklearn.base import clone
 from sklearn.model_selection import GroupKFold, KFold
 from sklearn.utils import check_consistent_length, check_random_state
 
 from ..exceptions import ignored
 from ..fitting.prior import CoefPrior
+from ..noise import as_noise
 from ..utils.optional import require
 from ..utils.sklearn import safe_indexing
 from ..utils.validation import check_fitted, check_integer, checked_groups
@@ -25,6 +26,8 @@ from .summary import html_table
 EVERYTHING = "all features"
 # A difference of log densities below this, in nats per row, does not matter.
 _LEAST = 0.01
+# Degrees of freedom of Student's t, by which rows count if the noise has outliers.
+_FREEDOM = 4.0
 # Probability of a difference by chance below which it counts, in Wilcoxon's signed-rank test.
 _CHANCE = 0.05
 
@@ -191,7 +194,8 @@ def feature_report(
     standard error is that of the mean over trajectories, or over rows without ``groups``. The group helps or hurts if
     the losses differ from 0 by Wilcoxon's signed-rank test at the level 0.05, and by 0.01 nats. Otherwise it does
     nothing if the mean loss is within 0.05 nats of 0 by two standard errors, and the verdict is "unclear" if not, or
-    if mean and median of the losses have different signs. The test needs at least six trajectories. Rows have weight 1.
+    if mean and median of the losses have different signs. The test needs at least six trajectories. Rows have weight 1,
+    and with `skevgp.noise.StudentT` the density of a Student-t with 4 degrees of freedom.
 
     Examples
     --------
@@ -293,7 +297,10 @@ def _without(model: Any, prior: Any, mask: np.ndarray | None, labels: np.ndarray
     else:
         kept = np.where(out[:, :, np.newaxis], 0.0, prior.root)
         own = CoefPrior(mean, cov=(kept @ kept.transpose(0, 2, 1))[first], shared=prior.shared, groups=groups)
-    return clone(model).set_params(coef_prior=own)
+    quiet: dict[str, Any] = {name: 0 for name in ("verbose",) if hasattr(model, name)}
+    if hasattr(getattr(model, "solver", None), "callback"):
+        quiet["solver__callback"] = None
+    return clone(model).set_params(coef_prior=own, **quiet)
 
 
 def _held_out(
@@ -309,7 +316,13 @@ def _held_out(
         mean, std = model.predict(safe_indexing(X, test), return_std=True)
     bound = getattr(model, "lower_bound_", None)
     bound = model.log_marginal_likelihood_value_ if bound is None else bound
-    each = norm.logpdf(y[test].reshape(mean.shape), mean, std)
+    # std is that of rows that are no outliers.
+    outliers = as_noise(model.noise).heavy_tails
+    each = (
+        t.logpdf(y[test].reshape(mean.shape), _FREEDOM, mean, std)
+        if outliers
+        else norm.logpdf(y[test].reshape(mean.shape), mean, std)
+    )
     density = each.reshape(len(test), -1).sum(axis=1)
     if labels is not None:
         density = np.array([density[labels[test] == label].mean() for label in np.unique(labels[test])])

@@ -218,10 +218,12 @@ class InertiaForceGravity(_NewtonFeatures):
         itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
     inverse_length : float, default=3.0
         Prior standard deviation of 1/l in 1/m, with the effective length l of a pendulum that a link would be. Gravity
-        decelerates the joints that it pulls by g/l times a sine, or by 1/l times a feature of `LinkGravity`.
+        decelerates the joints that it pulls by g/l times a sine, or by 1/l times a feature of `LinkGravity`. In units
+        of the data, its contribution has at most the standard deviation ``unknown_ratio``.
     unknown_ratio : float, default=1.0
         Prior standard deviation of what an input contributes to the velocity of its own joint, as a multiple of the
-        change that the prior mean of all features leaves (see the Notes of `InertiaForce`).
+        change that the prior mean of all features leaves (see the Notes of `InertiaForce`). With 0, inputs keep their
+        guesses, and gravity too.
     coupling_ratio : float, default=0.3
         The same for inputs and gravity at other joints, which act through the mass matrix, as a share of the standard
         deviations above. With 0 these weights stay 0.

@@ -95,8 +95,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
             self._layout = layout_of(robot)
             self._check_columns()
             self._check_steps(rows)
-            if self._timed:
-                self._mean_step = float(rows[:, -1].mean())
+            self._mean_step = float(rows[:, -1].mean()) if self._timed else None
         self._prepare(robot)
         return self
 
@@ -262,7 +261,7 @@ class VelocityPrior(NamedTuple):
     def of(cls, n_joints: int, n_features: int, ratio: float, group: str) -> VelocityPrior:
         """All weights alike, in units of the data."""
         shape = n_joints, n_features
-        return cls(np.full(shape, np.nan), np.full(shape, ratio), np.full(shape, group, dtype=object))
+        return cls(np.full(shape, np.nan), np.full(shape, ratio, dtype=float), np.full(shape, group, dtype=object))
 
     def set(self, where: Any, ratio: float, group: str) -> None:
         """Put some weights into another group, in units of the data."""

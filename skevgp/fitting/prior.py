@@ -220,7 +220,10 @@ def _groups(
                 f"groups of CoefPrior must be 'auto', None or the labels of all weights, of the shape {shape[1:]} or "
                 f"{shape}; got the shape {labels.shape}."
             )
-        groups[...] = np.vectorize(str, otypes=[object])(labels)
+        groups[...] = labels
+        groups[np.array([[label is None for label in row] for row in groups], dtype=bool)] = ""
+        if not all(isinstance(label, str) for label in groups.ravel()):
+            raise ValueError(f"groups of CoefPrior must be words, or None for none; got {prior.groups!r}.")
         return groups
     labelled = [part for part in parts if hasattr(part.feature_map, "coef_groups")]
     for part in [] if by_hand else labelled:
@@ -347,7 +350,7 @@ class _Part(NamedTuple):
 
 def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") -> Iterator[_Part]:
     """The maps with a prior inside pipelines and unions, given the first row of their X."""
-    if hasattr(feature_map, "coef_prior"):
+    if any(hasattr(feature_map, name) for name in ("coef_prior", "coef_scale", "coef_groups")):
         yield _Part(feature_map, columns, 1.0, name)
     elif isinstance(feature_map, Pipeline):
         steps = [step for _, step in feature_map.steps if step not in ("passthrough", None)]
@@ -378,6 +381,8 @@ def says_shared(feature_map: Any) -> bool:
 
 def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The result of a map's ``coef_prior``, checked."""
+    if not hasattr(feature_map, "coef_prior"):
+        return np.zeros(shape), np.full(shape, np.nan), _independent(shape)
     (k, p), prior, allowed = shape, feature_map.coef_prior(n_outputs), _shapes(shape)
     called = f"coef_prior of {feature_map!r}"
     parts = [as_floats(part, f"What {called} returns") for part in prior] if isinstance(prior, (tuple, list)) else []

@@ -74,7 +74,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     learn_scales : bool, default=True
         Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
-        it.
+        it. Factors are from 1e-4 to 1e4.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -309,7 +309,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         little = f"; of {self._unexplained} hardly anything is explained" if self._unexplained else ""
         return (
             f"The robot's model is far from what torques say: {named} masses may be placeholders, "
-            "or y in other units. Give RigidBodyRegressor wider scales, or y in N m. "
+            f"or y in other units. Give {'' if self.learn_scales else 'RigidBodyRegressor wider scales, or '}y in N m. "
             f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations{little}.)"
         )
 

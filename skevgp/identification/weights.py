@@ -70,6 +70,8 @@ class Weights:
     # Distance of the weights from the prior mean in prior standard deviations: root mean square over the directions
     # that rows determine, near 1 if the prior is right.
     surprise: float
+    # (P,): learned factors of the standard deviations of the prior as given. ``prior`` includes them.
+    factors: np.ndarray
 
     @property
     def n_weights(self) -> int:
@@ -136,8 +138,10 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
         z, covariance = _solve(B * weight[:, np.newaxis], errors * weight)
     mean, root = prior.mean + problem.root @ z, problem.root
     # In standard deviations of the prior as given.
+    if start is not None:
+        factors = factors * start.factors
     surprise = float(np.sqrt(np.sum((factors * z) ** 2) / max(1.0, len(z) - np.trace(covariance))))
-    return Weights(mean, root @ covariance @ root.T, prior, state.noise, state.times, inflation, surprise)
+    return Weights(mean, root @ covariance @ root.T, prior, state.noise, state.times, inflation, surprise, factors)
 
 
 def left_out(rows: Rows, weights: Weights) -> np.ndarray:
@@ -259,13 +263,15 @@ class _Problem:
         return np.concatenate(Bs), np.concatenate(errors)
 
     def log_probability(self, state: _State) -> float:
-        """Return the log probability of rows, as if independent, and weights, up to a constant."""
+        """Return the log marginal likelihood of rows, as if independent, and factors, up to a constant."""
         variances = _variances(state.noise, self.rows.speed)
         left = self.rows.targets - _forward(self.rows.features, state.mean, self.prior)
-        z = _solve(*self.whitened(state))[0]
-        # Of each group once.
-        logs = np.log(np.unique(state.factors))
-        return -0.5 * float(np.sum(np.log(variances) + left**2 / variances) + z @ z + logs @ logs)
+        # By Laplace's approximation: ½ log|Σ| of the posterior covariance of z.
+        z, covariance = _solve(*self.whitened(state))
+        of_rows = np.sum(np.log(variances) + left**2 / variances)
+        groups = [] if self.prior.groups is None else [group for group in dict.fromkeys(self.prior.groups) if group]
+        logs = np.log([state.factors[self.prior.groups == group][0] for group in groups])
+        return -0.5 * float(of_rows + z @ z - np.linalg.slogdet(covariance)[1] + logs @ logs)
 
 
 def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:

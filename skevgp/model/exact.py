@@ -152,23 +152,51 @@ class ExactModel:
     kernels: tuple[Kernel, ...] | None = None
 
     def with_fewer_features(self) -> ExactModel:
-        """The model of the same likelihood with at most as many features as rows. Shared or vague weights stay."""
-        # With the QR factorisation H C = Rᵀ Qᵀ, Q (p, n) and R (n, n), the rows depend on Qᵀ w ~ N(-Qᵀ w₀, I) only. So
-        # Rᵀ replaces H, and Qᵀ w₀ replaces w₀.
+        """The model of the same likelihood with at most as many features as rows in each group of weights.
+
+        Shared or vague weights stay.
+        """
+        # With the QR factorisation H C = Rᵀ Qᵀ of a group, Q (p, n) and R (n, n), the rows depend on Qᵀ w ~ N(-Qᵀ w₀,
+        # I) only. So Rᵀ replaces H, and Qᵀ w₀ replaces w₀. The group's factor multiplies both.
         (o, p), n = self.prior.scale.shape, len(self.rows.inputs)
-        if p <= n or self.prior.shared or self.vague.any() or self.prior.n_groups:
+        groups = np.full((o, p), -1) if self.prior.groups is None else self.prior.groups
+        largest = max(np.count_nonzero(own == group) for own in groups for group in np.unique(own)) if p else 0
+        if largest <= n or self.prior.shared or self.vague.any():
             return self
-        features, reference = np.empty((n, o, n)), np.empty((o, n))
+        found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for index, (scale, w0) in enumerate(zip(self.prior.scale, self.prior.reference, strict=True)):
             H = self.rows.of(slice(index, index + 1)).features
             A = (H * scale if self.prior.root is None else H @ self.prior.root[index]).T
-            # With large rows first, each row keeps its digits (Higham 2002, section 19.4).
-            order = np.argsort(-np.abs(A).max(axis=1))
-            Q, R = np.linalg.qr(A[order])
-            features[:, index], reference[index] = R.T, Q.T @ w0[order]
-        prior = CoefficientPrior(np.zeros((o, n)), np.ones((o, n)), reference)
+            parts = []
+            for group in np.unique(groups[index]):
+                own = np.flatnonzero(groups[index] == group)
+                features, reference = A[own].T, w0[own]
+                if len(own) > n:
+                    # With large rows first, each row keeps its digits (Higham 2002, section 19.4).
+                    own = own[np.argsort(-np.abs(A[own]).max(axis=1))]
+                    Q, R = np.linalg.qr(A[own])
+                    features, reference = R.T, Q.T @ w0[own]
+                parts.append((features, reference, np.full(len(reference), group)))
+            every_feature, every_reference, every_group = zip(*parts, strict=True)
+            found.append(
+                (np.concatenate(every_feature, axis=1), np.concatenate(every_reference), np.concatenate(every_group))
+            )
+        # Outputs may have different numbers of features: others are 0.
+        width = max(len(reference) for _, reference, _ in found)
+        features, reference = np.zeros((n, o, width)), np.zeros((o, width))
+        labels = np.full((o, width), -1)
+        for index, (own_features, own_reference, own_groups) in enumerate(found):
+            k = len(own_reference)
+            features[:, index, :k], reference[index, :k], labels[index, :k] = own_features, own_reference, own_groups
+        prior = CoefficientPrior(
+            np.zeros((o, width)),
+            np.ones((o, width)),
+            reference,
+            labels=self.prior.labels,
+            groups=None if self.prior.groups is None else labels,
+        )
         rows = replace(self.rows, features=features)
-        return replace(self, prior=prior, vague=np.zeros((o, n), dtype=bool), rows=rows)
+        return replace(self, prior=prior, vague=np.zeros((o, width), dtype=bool), rows=rows)
 
     def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
         """The kernel at the rows, for all outputs or for each, and each output given it."""

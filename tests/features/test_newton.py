@@ -305,3 +305,11 @@ def test_levers_of_another_robot_must_fit():
 def test_gravity_that_is_not_link_gravity_raises(gravity):
     with pytest.raises(ValueError, match="'gravity' parameter .* must be an instance of .*LinkGravity' or None"):
         InertiaForceGravity("iiwa14", gravity=gravity).fit(arm_rows())
+
+
+@pytest.mark.parametrize("name", ["known_rate", "unknown_ratio", "coupling_ratio", "other_ratio", "inverse_length"])
+def test_scales_may_be_integers(name):
+    whole, real = (InertiaForceGravity("acrobot", **{name: kind(0)}) for kind in (int, float))
+    left_over, size = np.arange(1.0, 5.0), np.arange(1.0, 8.0)
+    assert_array_equal(whole.coef_prior(4)[1], real.coef_prior(4)[1])
+    assert_array_equal(whole.coef_scale(left_over, size), real.coef_scale(left_over, size))

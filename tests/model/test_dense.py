@@ -128,3 +128,27 @@ def test_points_at_all_rows_give_exact_model(p, weighted):
     statistics, expected = model.statistics(values, blocks), Dense(raw, model.prior, exact=True).likelihood(values)
     assert model.bound(values, statistics, blocks) == pytest.approx(expected, rel=1e-6)
     assert model.upper_bound(values, statistics, blocks) == pytest.approx(expected, rel=1e-6)
+
+
+def test_more_features_than_rows_are_as_many_as_rows_in_each_group():
+    """Also with a factor on the scales of each group."""
+    sparse, raw, table = setting("full", 1, False, False, 3)
+    rng = np.random.RandomState(1)
+    n, p = 5, 20
+    raw = replace(raw, inputs=raw.inputs[:n], targets=raw.targets[:n], features=rng.randn(n, p))
+    groups = np.tile(np.repeat([-1, 0, 1], [3, 8, 9]), (O, 1))
+    prior = replace(
+        sparse.prior,
+        mean=np.zeros((O, p)),
+        scale=0.5 + rng.rand(O, p),
+        reference=rng.randn(O, p),
+        groups=groups,
+    )
+    model = ExactModel(sparse.kernel, prior, np.zeros((O, p), dtype=bool), raw)
+    fewer, values = model.with_fewer_features(), table.values_at_start()
+    assert fewer.prior.scale.shape == (O, 13)
+    values["noise"] = np.full(O, 0.3)
+    (value, gradient), (expected, expected_gradient) = (each.log_likelihood(values) for each in (fewer, model))
+    assert value == pytest.approx(expected, rel=1e-10)
+    for name, own in expected_gradient.items():
+        assert_allclose(gradient[name], own, rtol=1e-8, atol=1e-10)
