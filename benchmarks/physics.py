@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import itertools
 from collections import namedtuple
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,13 +47,19 @@ NOISES = (0.01, 0.0)
 FEW, MANY = 4, {**dict.fromkeys(SYSTEMS, 0), **dict.fromkeys(UNSEEN, 40)}  # 0: the paper's number
 TEST_TRAJECTORIES, STEPS = 40, 100
 WRONG = ("another robot", "gravity upwards", "noise")
-# Upwards: (rad/s²) per sine of the angle, which is -19.6 for the pendulum.
+# A guess of the deceleration by gravity, rad/s² per sine of the angle. For the pendulum it is +19.6.
 UPWARDS = -20.0
 OTHER = {"acrobot": "cartpole", "cartpole": "acrobot"}
 
 Errors = namedtuple("Errors", "system noise trajectories seed")
 Wrong = namedtuple("Wrong", "map system noise trajectories seed")
 Rollouts = namedtuple("Rollouts", "system noise trajectories seed")
+
+
+def shortened(model: RegressorMixin, quick: bool) -> RegressorMixin:
+    """Return the model, which has few iterations if it is quick."""
+    few = {name: 3 for name in model.get_params() if name.endswith("max_iter")}
+    return model.set_params(**few) if quick else model
 
 
 def build(model: str, system: str, seed: int) -> RegressorMixin:
@@ -67,8 +74,7 @@ def scores(model: RegressorMixin, cell: Any, quick: bool = False) -> dict[str, A
     """Fit a model and return its scores on other trajectories."""
     train = make_dynamics(cell.system, cell.trajectories or None, noise=cell.noise, random_state=cell.seed)
     test = make_dynamics(cell.system, TEST_TRAJECTORIES, random_state=1000 + cell.seed)
-    if quick:
-        model.set_params(**{name: 3 for name in model.get_params() if name.endswith("max_iter")})
+    model = shortened(model, quick)
     seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, groups=train.groups))
     mean, std = model.predict(test.data, return_std=True)
     size = cell.noise * train.trajectories[:, 1:].reshape(train.target.shape).std(axis=0)
@@ -121,9 +127,7 @@ def run_rollouts(cell: Rollouts, quick: bool = False) -> list[dict[str, Any]]:
     inputs = test.data[:, n_states:].reshape(TEST_TRAJECTORIES, STEPS, -1)
     rows = []
     for name in MODELS:
-        model = build(name, cell.system, cell.seed)
-        if quick:
-            model.set_params(**{each: 3 for each in model.get_params() if each.endswith("max_iter")})
+        model = shortened(build(name, cell.system, cell.seed), quick)
         harness.timed(lambda model=model: model.fit(train.data, train.target, groups=train.groups))
         try:
             with harness.one_thread():
@@ -195,6 +199,7 @@ def tables_of_wrong(rows: pd.DataFrame) -> harness.Tables:
 
 def tables_of_rollouts(rows: pd.DataFrame) -> harness.Tables:
     keys = ["system", "noise", "trajectories"]
+    rows = rows.assign(trajectories=rows["trajectories"].replace(0, "all"))
     wide = rows.pivot_table(index=keys, columns="model", values="error", sort=False, aggfunc="median")
     return {"rollouts": wide[list(MODELS)].reset_index()}
 
@@ -215,14 +220,6 @@ def cells_of(part: str, options: Any) -> list[Any]:
     return [Wrong(name, *cell) for name in WRONG for cell in cells if name != "another robot" or cell[0] in OTHER]
 
 
-def run(cell: Any) -> list[dict[str, Any]]:
-    return JOBS[type(cell).__name__.lower()](cell)
-
-
-def run_quickly(cell: Any) -> list[dict[str, Any]]:
-    return JOBS[type(cell).__name__.lower()](cell, quick=True)
-
-
 JOBS = {"errors": run_errors, "wrong": run_wrong, "rollouts": run_rollouts}
 TABLES = {"errors": tables_of_errors, "wrong": tables_of_wrong, "rollouts": tables_of_rollouts}
 FILES = {"errors": "physics", "wrong": "physics_wrong", "rollouts": "physics_rollouts"}
@@ -239,7 +236,7 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", choices=[*SYSTEMS, *UNSEEN], help="default: all")
     options = harness.parse(parser)
     output = harness.output_path(options, FILES[options.part])
-    job = run_quickly if options.quick else run
+    job = partial(JOBS[options.part], quick=options.quick)
     n_failures = harness.run_missing(cells_of(options.part, options), job, output, options.jobs)
     harness.write_page(TITLES[options.part], TABLES[options.part](harness.frame(output)), output, n_failures)
 

@@ -220,38 +220,38 @@ def feature_report(
     labels = np.where(labels == "", "features", labels)
     # A weight that cannot move is no part of a group, unless all are left out.
     labels = np.where(prior.scale > 0.0, labels, "")
-    names = [name for name in dict.fromkeys(labels.ravel()) if name]
-    found = [_of_weights(model, name, labels == name) for name in names]
-    found.append(_of_weights(model, EVERYTHING, np.ones(labels.shape, dtype=bool)))
+    masks = {name: labels == name for name in dict.fromkeys(labels.ravel()) if name}
+    masks[EVERYTHING] = np.ones(labels.shape, dtype=bool)
+    found = [_of_weights(model, name, mask) for name, mask in masks.items()]
     if X is None:
         return FeatureReport(tuple(found), "")
     if y is None:
         raise ValueError("feature_report needs y with X.")
     check_consistent_length(X, y)
     target = np.asarray(y)
-    names_of_rows = checked_groups(groups, len(target))
-    if names_of_rows is None:
+    trajectories = checked_groups(groups, len(target))
+    if trajectories is None:
         splits = list(KFold(n_splits, shuffle=True, random_state=check_random_state(random_state)).split(target))
     else:
-        splits = list(GroupKFold(n_splits).split(target, groups=names_of_rows))
-    masks = [None, *(labels == name for name in names), np.ones(labels.shape, dtype=bool)]
-    jobs = [(_without(model, prior, mask, labels), split) for mask in masks for split in splits]
-    with ignored():
-        results = Parallel(n_jobs)(delayed(_held_out)(one, X, target, names_of_rows, split) for one, split in jobs)
-    bounds = np.array([bound for bound, _ in results]).reshape(len(masks), len(splits))
-    densities = [
-        np.concatenate([own for _, own in results[i * len(splits) :][: len(splits)]]) for i in range(len(masks))
-    ]
+        splits = list(GroupKFold(n_splits).split(target, groups=trajectories))
+    # The whole model first.
+    nothing = np.zeros(labels.shape, dtype=bool)
+    models = [_without(model, prior, mask) for mask in (nothing, *masks.values())]
+    jobs = [(one, split) for one in models for split in splits]
+    results = Parallel(n_jobs)(delayed(_held_out)(one, X, target, trajectories, split) for one, split in jobs)
+    of_models = [results[start:][: len(splits)] for start in range(0, len(results), len(splits))]
+    bounds = [np.mean([bound for bound, _ in own]) for own in of_models]
+    densities = [np.concatenate([density for _, density in own]) for own in of_models]
     for i in range(len(found)):
         losses = densities[0] - densities[1 + i]
         loss, error = float(losses.mean()), float(losses.std(ddof=1) / np.sqrt(len(losses)))
         found[i] = found[i]._replace(
-            bound_loss=float(np.mean(bounds[0] - bounds[1 + i])),
+            bound_loss=float(bounds[0] - bounds[1 + i]),
             held_out_loss=loss,
             held_out_error=error,
             verdict=_verdict(losses, loss, error),
         )
-    return FeatureReport(tuple(found), "rows" if names_of_rows is None else "trajectories")
+    return FeatureReport(tuple(found), "rows" if trajectories is None else "trajectories")
 
 
 def _verdict(losses: np.ndarray, loss: float, error: float) -> str:
@@ -285,9 +285,8 @@ def _of_weights(model: Any, name: str, mask: np.ndarray) -> FeatureGroup:
     )
 
 
-def _without(model: Any, prior: Any, mask: np.ndarray | None, labels: np.ndarray) -> Any:
-    """An unfitted copy of a model in which the weights of a group are 0."""
-    out = np.zeros(labels.shape, dtype=bool) if mask is None else mask
+def _without(model: Any, prior: Any, out: np.ndarray) -> Any:
+    """An unfitted copy of a model in which some weights are 0."""
     first = 0 if prior.shared else slice(None)
     groups = None if prior.groups is None else model.coef_groups_
     scale = np.where(np.isinf(np.atleast_2d(model.coef_prior_scale_)), np.inf, prior.scale)
@@ -297,7 +296,7 @@ def _without(model: Any, prior: Any, mask: np.ndarray | None, labels: np.ndarray
     else:
         kept = np.where(out[:, :, np.newaxis], 0.0, prior.root)
         own = CoefPrior(mean, cov=(kept @ kept.transpose(0, 2, 1))[first], shared=prior.shared, groups=groups)
-    quiet: dict[str, Any] = {name: 0 for name in ("verbose",) if hasattr(model, name)}
+    quiet: dict[str, Any] = {"verbose": 0}
     if hasattr(getattr(model, "solver", None), "callback"):
         quiet["solver__callback"] = None
     return clone(model).set_params(coef_prior=own, **quiet)

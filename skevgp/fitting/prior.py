@@ -43,10 +43,10 @@ class CoefPrior(StatefulEstimator):
         they depend on each other (``predict(X, return_cov="joint")``). ``"auto"`` asks the feature map's attribute
         ``share_coef``. Not for Adam or the diagonal posterior.
     groups : array-like of str of shape (n_h,) or (n_outputs, n_h), "auto" or None, default="auto"
-        Labels of groups of weights, one group for each output and label. The fit learns a factor for the standard
-        deviations of each group, together with kernel and noise. It has a log-normal prior around 1, and its logarithm
-        has the standard deviation 1. An empty label keeps the standard deviation as it is. ``"auto"`` asks the feature
-        map, unless ``scale`` or ``cov`` are given. If None, all standard deviations stay.
+        Labels of the weights. Weights of one output with the same label are a group. The fit learns a factor for the
+        standard deviations of each group, together with kernel and noise. The logarithm of the factor has the prior
+        N(0, 1). A weight with an empty label keeps its standard deviation. ``"auto"`` asks the feature map, unless
+        ``scale`` or ``cov`` are given. If None, all standard deviations stay.
 
     Examples
     --------
@@ -157,6 +157,7 @@ def resolved(
         correlation[:, part.columns[:, np.newaxis], part.columns] = part_correlation
     if _word(prior.mean) != "auto":
         mean = _as_table(prior.mean, "mean of CoefPrior", shape, shared)
+    _check_finite(mean, "mean of CoefPrior")
     scale_name = 'scale="auto" of CoefPrior, the feature map\'s or 10 std(y) / rms of a feature,'
     if prior.cov is not None:
         scale, correlation = _of_covariance(prior.cov, "cov of CoefPrior", shape)
@@ -164,9 +165,7 @@ def resolved(
         scale_name = "scale of CoefPrior"
         scale, correlation = _as_table(prior.scale, scale_name, shape, shared), _independent(shape)
     else:
-        _check_finite(mean, "mean of CoefPrior")
         scale = _in_units_of_data(scale, mean, parts, data)
-    _check_finite(mean, "mean of CoefPrior")
     _check_finite(np.where(scale == np.inf, data.wide, scale) if allow_vague else scale, scale_name)
     if (scale < 0).any():
         raise ValueError(f"scale of CoefPrior must not be negative; its smallest value is {scale.min()}.")
@@ -350,7 +349,7 @@ class _Part(NamedTuple):
 
 def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") -> Iterator[_Part]:
     """The maps with a prior inside pipelines and unions, given the first row of their X."""
-    if any(hasattr(feature_map, name) for name in ("coef_prior", "coef_scale", "coef_groups")):
+    if any(hasattr(feature_map, method) for method in ("coef_prior", "coef_scale", "coef_groups")):
         yield _Part(feature_map, columns, 1.0, name)
     elif isinstance(feature_map, Pipeline):
         steps = [step for _, step in feature_map.steps if step not in ("passthrough", None)]

@@ -124,10 +124,7 @@ class ElboObjective:
         )
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         loss += 0.5 * len(values["noise"]) * self.blocks.linear.log_variance
-        scales: Values = {"coef_factors": np.zeros(np.shape(values.get("coef_factors", ())))}
-        loss -= log_prior(values, scales)
-        if "coef_factors" in values:
-            gradient["coef_factors"] -= scales["coef_factors"]
+        loss += log_prior(values, gradient, sign=-1.0)
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 
     def solution(self, x: np.ndarray) -> tuple[float, Predictor]:
@@ -195,6 +192,8 @@ class ElboTerms:
             "signal": 0.5 * slope - from_mean + spread.log_signal,
             "noise": 0.5 * (self._n_rows - data - slope) + spread.log_noise,
         }
+        if not (self._has_parameters or group.prior.n_groups):
+            return loss, gradient
         HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
         from_weights = (HE / group.noise).T * group.prior.scale
         if group.prior.n_groups:

@@ -58,8 +58,8 @@ class Parameter:
         return limits
 
 
-def log_prior(values: Values, gradient: Values | None = None) -> float:
-    """The log prior density of the logarithms of ``coef_factors``, without its constant.
+def log_prior(values: Values, gradient: Values | None = None, sign: float = 1.0) -> float:
+    """The log prior density of the logarithms of ``coef_factors``, without its constant, times ``sign``.
 
     They are standard normal: a factor is e or 1/e at one standard deviation. The gradient is added to ``gradient``.
     """
@@ -67,8 +67,8 @@ def log_prior(values: Values, gradient: Values | None = None) -> float:
         return 0.0
     logs = np.log(values["coef_factors"])
     if gradient is not None:
-        gradient["coef_factors"] -= logs
-    return -0.5 * float((logs**2).sum())
+        gradient["coef_factors"] -= sign * logs
+    return -0.5 * sign * float((logs**2).sum())
 
 
 class ParameterTable:
