@@ -27,8 +27,8 @@ from ..utils.validation import check_magnitude, check_not_vanishing, unchanged_i
 from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
-from .stiction import likeliest_noise
-from .weights import Rows, condensed, left_out
+from .moves import of_move, terms
+from .weights import Rows, Fold, condensed, folds
 
 # Weights that differ from their prior by more prior standard deviations than this make the prior doubtful.
 _FAR = 4.0
@@ -255,13 +255,6 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             doubt = self._fit(X, y, groups, pieces)
         if doubt:
             warn_user(doubt, ConvergenceWarning)
-        lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
-        if lost:
-            warn_user(
-                f"The residuals of {lost} do not repeat in any left-out group of rows, so that physics alone predicts "
-                "these torques. More trajectories may help. Set n_inducing=0 to fit no residuals.",
-                ConvergenceWarning,
-            )
         return self
 
     def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> str:
@@ -324,13 +317,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     def _residuals(self, X: np.ndarray, rows: Rows) -> list[JointResidual]:
         weights, y = self._weights, rows.targets
-        guessed = left_out(rows, weights)
-        if self.n_inducing == 0:
-            every = zip((y - guessed).T, rows.speed.T, weights.noise, strict=True)
-            return [
-                JointResidual(None, likeliest_noise(left, speed, last.coulomb, last.velocity, last.variance))
-                for left, speed, last in every
-            ]
+        parts = folds(rows, weights)
+        guessed = np.empty_like(y)
+        for part in parts:
+            guessed[part.out] = part.torques[part.out]
         residual = y - weights.predict(rows.features)
         some = np.unique(np.linspace(0, len(y) - 1, min(len(y), self.max_rows)).astype(int))
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
@@ -340,10 +330,12 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             delayed(fit_joint_residual)(
                 self._own(X, guessed, j),
                 residual[:, j],
+                [Fold(part.out, part.torques[:, j]) for part in parts],
+                y[:, j],
+                rows,
                 rows.speed[:, j],
                 weights.noise[j],
                 min(float(velocity), _SHARP),
-                rows.blocks,
                 some,
                 smooth,
                 **options,
@@ -399,16 +391,16 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         n_outputs = len(self._joints)
         features = self._features(rows, n_outputs)
         physics = self._weights.predict(features)
-        own = [self._own(rows, physics, j) for j in range(n_outputs)]
-        if not return_std:
-            return self._like_y(physics + np.column_stack([f.mean(x) for f, x in zip(self._joints, own, strict=True)]))
-        found = [f.moments(x) for f, x in zip(self._joints, own, strict=True)]
-        mean = physics + np.column_stack([missed for missed, _ in found])
-        variance = self._weights.variance(features) + np.column_stack([uncertain for _, uncertain in found])
-        if include_noise:
-            speed = self._speed(rows, n_outputs)
-            variance += np.column_stack([f.noise.of(v) for f, v in zip(self._joints, speed.T, strict=True)])
-        return self._like_y(mean), self._like_y(np.sqrt(variance))
+        speed = self._speed(rows, n_outputs)
+        mean, variance = physics.copy(), self._weights.variance(features) if return_std else np.zeros_like(physics)
+        for j, joint in enumerate(self._joints):
+            z = terms(speed[:, j], physics[:, j], joint.noise.velocity)
+            for more, uncertain in (joint.moments(self._own(rows, physics, j)), joint.move.moments(z)):
+                mean[:, j] += more
+                variance[:, j] += uncertain
+            if include_noise:
+                variance[:, j] += joint.noise.of(speed[:, j])
+        return (self._like_y(mean), self._like_y(np.sqrt(variance))) if return_std else self._like_y(mean)
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         return like_y(values) if self._one_dimensional else values

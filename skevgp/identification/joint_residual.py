@@ -6,21 +6,31 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
+from sklearn.base import clone
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from ..estimators.evgp import EVGPRegressor
 from ..kernels.parse import KernelSpec
+from .moves import MoveEffects, terms, variation
 from .stiction import JointNoise, likeliest_noise, noise_at
+from .weights import Fold, Rows
 
 # Smallest mean square of a residual torque that a kernel is fitted to.
 _NOTHING = 1e-90
 # Limits of the kernel, in standard deviations of residuals and of columns. A signal that is larger than the residuals,
-# or changes within less than the range of positions, is valid for one trajectory only. Friction does change within a
-# fraction of the range of speeds.
+# or changes within less than the range of positions, is valid for one move only. Friction does change within a fraction
+# of the range of speeds. With length scales beyond the last limit, f would not return to 0 outside the training moves.
 _LARGEST_SIGNAL, _SMALLEST_SIGNAL = 1.0, 1e-3
-_SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 100.0
+_SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 3.0
 # Least noise with f, as a share of the noise without f.
 _LEAST = 1e-6
+# Least share of the noise of left-out moves that is not the uncertainty of f.
+_OWN = 0.05
+# A fit without a move has at most this number of rows and iterations.
+_ROWS_OF_TRIAL, _ITERATIONS_OF_TRIAL = 500, 20
+# Shares of f that are tried, and the probability that a useless f is kept.
+_SHARES, _BY_CHANCE = np.linspace(0.0, 1.0, 11), 0.05
 
 
 class QuietRegressor(EVGPRegressor):
@@ -29,65 +39,119 @@ class QuietRegressor(EVGPRegressor):
     def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
         """Do not warn."""
 
+    def faded(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean of f, less where it is uncertain, and the variance, (n,) each."""
+        # The mean m is multiplied by 1 - v / s², with the variances v and s² of f after and before data. That is 1 at
+        # training rows and 0 far from them.
+        kernel: Any = self.kernel_
+        mean, std = self.predict(x, return_std=True, include_noise=False)
+        return np.maximum(1.0 - std**2 / kernel.k1.constant_value, 0.0) * mean, std**2
+
 
 @dataclass(frozen=True)
 class JointResidual:
-    """f(x_j) ~ GP of a joint's residual torque, and its noise."""
+    """a f(x_j), with a Gaussian process f of a joint's residual torque and a share a; effects of moves; noise."""
 
-    model: EVGPRegressor | None  # of the joint's own columns; None if physics alone predicts
+    model: QuietRegressor | None  # of the joint's own columns; None if physics alone predicts
     noise: JointNoise
-    held_for_no_group: bool = False  # whether the signal was valid for no left-out group
+    share: float
+    effects: MoveEffects  # of a move that no row is known of, as moves differ
+    move: MoveEffects  # of the move that rows are predicted of
 
     @property
     def signal(self) -> float:
-        """Prior standard deviation of f."""
+        """Prior standard deviation of a f."""
         if self.model is None:
             return 0.0
         kernel: Any = self.model.kernel_
-        return float(np.sqrt(kernel.k1.constant_value))
+        return self.share * float(np.sqrt(kernel.k1.constant_value))
 
     def mean(self, x: np.ndarray) -> np.ndarray:
-        return np.zeros(len(x)) if self.model is None else self.model.predict(x)
+        return self.moments(x)[0]
 
     def moments(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and variance of f, (n,) each."""
+        """Return mean and variance of a f, (n,) each."""
         if self.model is None:
             return np.zeros(len(x)), np.zeros(len(x))
-        mean, std = self.model.predict(x, return_std=True, include_noise=False)
-        return mean, std**2
+        mean, variance = self.model.faded(x)
+        return self.share * mean, self.share**2 * variance
 
 
 def fit_joint_residual(
     x: np.ndarray,
     residual: np.ndarray,
+    folds: list[Fold],
+    target: np.ndarray,
+    rows: Rows,
     speed: np.ndarray,
     noise: JointNoise,
     velocity: float,
-    groups: np.ndarray,
-    rows: np.ndarray,
+    some: np.ndarray,
     smooth: np.ndarray,
     **options: Any,
 ) -> JointResidual:
-    """Fit the Gaussian process of a joint to some rows of x (n, d), and its noise to all rows."""
-    # noise is that of the residual (n,) without f. Below velocity v_s, the lowest speed at which friction may have a
+    """Fit the Gaussian process of a joint to some of the rows x (n, d), and find by left-out moves what it is worth."""
+    # residual (n,) is that of weights of all rows. folds have the torques by weights of other moves, beside the target
+    # (n,). noise is that of the residual without f. Below velocity v_s, the lowest speed at which friction may have a
     # sign, rows count less for f. If filters blur the sign, the noise is larger up to a higher speed, but there f
-    # learns the average friction. groups (n,) are left out to calibrate signal and noise; rows are the indices that f
-    # is fitted to; smooth (d,) are the columns of x with long length scales; options are those of EVGPRegressor.
+    # learns the average friction. some are the indices that f is fitted to; smooth (d,) are the columns of x with long
+    # length scales; options are those of EVGPRegressor.
+    physics, missed = np.empty(len(x)), np.empty(len(x))
+    for fold in folds:
+        physics[fold.out] = fold.torques[fold.out]
+        missed[fold.out] = (target - fold.torques)[fold.out]
+
+    def ended(model: QuietRegressor | None, share: float, missed: np.ndarray, found: JointNoise) -> JointResidual:
+        z = terms(speed, physics, found.velocity)
+        effects, found = variation(z, missed, speed, found, rows)
+        return JointResidual(model, found, share, effects, effects)
+
     size = float(np.mean(residual**2))
+    found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, noise.variance)
     if size <= _NOTHING:
-        return JointResidual(None, noise)
-    spread = x[rows].std(axis=0)
-    spread = np.where(spread > 1e-9 * np.abs(x[rows]).max(axis=0), spread, 1.0)
+        nothing = MoveEffects.none()
+        return JointResidual(None, found, 0.0, nothing, nothing)
+    if not options["n_inducing"]:
+        return ended(None, 0.0, missed, found)
+    spread = x[some].std(axis=0)
+    spread = np.where(spread > 1e-9 * np.abs(x[some]).max(axis=0), spread, 1.0)
     shortest = np.where(smooth, _SHORTEST, _SHORTEST_OF_SPEED)
     signal = ConstantKernel(0.25 * size, (_SMALLEST_SIGNAL**2 * size, _LARGEST_SIGNAL**2 * size))
     kernel = signal * RBF(_START * spread, np.column_stack([shortest * spread, _LONGEST * spread]))
     least = _LEAST * noise.variance
     sharp = noise_at(residual, speed, noise.coulomb, velocity, least)
     relative = sharp.of(speed) / sharp.variance
-    model = QuietRegressor(kernel=kernel, **options)
-    model.fit(x[rows], residual[rows], groups=groups[rows], relative_variance=relative[rows])
-    left = residual - model.predict(x)
-    found = likeliest_noise(left, speed, noise.coulomb, noise.velocity, least)
-    # Left-out groups show how much larger the noise is than on the rows that f was fitted to.
-    growth = max(1.0, float(model.noise_variance_ / max(np.mean(left**2 / relative), 1e-300)))
-    return JointResidual(model, found._replace(variance=growth * found.variance), model._fitted.gone > 0)
+    model = QuietRegressor(kernel=kernel, noise_cv=None, **options)
+    # Each move is predicted by a fit to the others. It starts anew: parameters of the last search know the move.
+    mean, variance = np.empty(len(x)), np.empty(len(x))
+    iterations = model.max_iter if model.max_iter is not None else _ITERATIONS_OF_TRIAL
+    trial = clone(model).set_params(max_iter=min(iterations, _ITERATIONS_OF_TRIAL))
+    for fold in folds:
+        kept = some[~fold.out[some]] if not fold.out.all() else some
+        kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _ROWS_OF_TRIAL)).astype(int))]
+        trial.fit(x[kept], (target - fold.torques)[kept], relative_variance=relative[kept])
+        mean[fold.out], variance[fold.out] = trial.faded(x[fold.out])
+    share = _share(missed, mean, relative, folds)
+    if share == 0.0:
+        return ended(None, 0.0, missed, found)
+    model.fit(x[some], residual[some], relative_variance=relative[some])
+    missed = missed - share * mean
+    found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
+    own = share**2 * float(np.mean(variance / relative))
+    return ended(model, share, missed, found._replace(variance=max(found.variance - own, _OWN * found.variance)))
+
+
+def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, folds: list[Fold]) -> float:
+    """Return the share of f that fits left-out moves best, or 0 if it may be useless."""
+    # Each move counts the same, however large its torques are: the mean over moves of the logarithm of the mean square.
+    # f is kept if a t-test says that the logarithm falls.
+    squares = np.array(
+        [[np.mean((missed - a * mean)[fold.out] ** 2 / relative[fold.out]) for fold in folds] for a in _SHARES]
+    )
+    falls = np.log(np.maximum(squares, 1e-300)) - np.log(np.maximum(squares[0], 1e-300))
+    best = int(np.argmin(falls.mean(axis=1)))
+    fall, count = falls[best], len(folds)
+    if best == 0 or count < 2:
+        return 0.0
+    error = fall.std(ddof=1) / np.sqrt(count)
+    return float(_SHARES[best]) if fall.mean() < student.ppf(_BY_CHANCE, count - 1) * error else 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 # If one group has at least this share of the rows, groups are cut into this number of blocks.
-_LARGEST_SHARE, _BLOCKS = 0.5, 5
+_LARGEST_SHARE, _BLOCKS = 0.8, 5
 
 
 def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:

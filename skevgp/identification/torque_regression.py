@@ -45,7 +45,8 @@ class TorqueRegression(StatefulEstimator):
         features = self._features(X, n_outputs)
         check_magnitude(features, "What feature_map_ returns")
         blocks = blocks_of(labels, n)
-        return Rows(features, y, self._speed(X, n_outputs), runs, groups_of(labels, blocks), blocks)
+        n_moves = 1 if labels is None else len(np.unique(labels))
+        return Rows(features, y, self._speed(X, n_outputs), runs, groups_of(labels, blocks), blocks, n_moves)
 
     def _speed(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
         """Return q̇ of each joint, (n, o)."""

@@ -35,9 +35,11 @@ class Rows:
     runs: np.ndarray  # (n,) labels of rows that follow each other without a gap
     groups: np.ndarray  # (n,) labels of rows that may differ from others as a whole
     blocks: np.ndarray  # (n,) labels of rows that are left out together
+    n_moves: int = 1  # number of trajectories that the user named
 
     def __getitem__(self, chosen: np.ndarray) -> Rows:
-        return Rows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        arrays = (getattr(self, name)[chosen] for name in self.__dataclass_fields__ if name != "n_moves")
+        return Rows(*arrays, self.n_moves)
 
 
 @dataclass(frozen=True)
@@ -144,14 +146,21 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
     return Weights(mean, root @ covariance @ root.T, prior, state.noise, state.times, inflation, surprise, factors)
 
 
-def left_out(rows: Rows, weights: Weights) -> np.ndarray:
-    """Predict each block of rows by weights from the other blocks, (n, o)."""
-    predicted = np.empty_like(rows.targets)
+class Fold(NamedTuple):
+    """Rows that were left out, and what the weights from the other rows predict."""
+
+    out: np.ndarray  # (n,) whether a row was left out
+    torques: np.ndarray  # (n, o) of all rows
+
+
+def folds(rows: Rows, weights: Weights) -> list[Fold]:
+    """Identify the weights again without each block of rows."""
+    found = []
     for block in np.unique(rows.blocks):
         out = rows.blocks == block
         kept = rows[~out] if not out.all() else rows
-        predicted[out] = identify(kept, weights.prior, start=weights).predict(rows.features[out])
-    return predicted
+        found.append(Fold(out, identify(kept, weights.prior, start=weights).predict(rows.features)))
+    return found
 
 
 class Known(NamedTuple):
