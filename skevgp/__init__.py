@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from .estimators.report import FeatureReport, feature_report
     from .estimators.residual import ResidualRegressor
     from .fitting.prior import CoefPrior
+    from .identification.contact import ContactMonitor
     from .identification.inverse_dynamics import InverseDynamics
 
 __all__ = [
     "BayesianMLPRegressor",
     "CoefPrior",
+    "ContactMonitor",
     "EGPRegressor",
     "EVGPRegressor",
     "FeatureReport",
@@ -44,6 +46,7 @@ _SUBMODULES = ("datasets", "exceptions", "features", "io", "kernels", "metrics",
 _HOME = {
     "BayesianMLPRegressor": "estimators.bnn",
     "CoefPrior": "fitting.prior",
+    "ContactMonitor": "identification.contact",
     "EGPRegressor": "estimators.egp",
     "EVGPRegressor": "estimators.evgp",
     "FeatureReport": "estimators.report",

@@ -178,6 +178,16 @@ class IdentifiedRobot(TorqueRegression):
             overwrite=overwrite,
         )
 
+    def _new_log(self, X: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows (n, d) and torques (n, o) of another log of the robot."""
+        rows, targets = validate_numbers(self, X, y, reset=False, dtype=np.float64)
+        targets = np.asarray(targets, dtype=np.float64).reshape(len(rows), -1)
+        if targets.shape[1] != len(self._joints):
+            raise ValueError(f"y has {targets.shape[1]} columns; the robot has {len(self._joints)} joints.")
+        check_magnitude(rows, "X")
+        check_magnitude(targets, "y")
+        return rows, targets
+
     def _inertial(self) -> tuple[np.ndarray, np.ndarray]:
         """Return means (n_links, 10) and covariance of the links' parameters."""
         size = 10 * len(self._outputs)
@@ -257,12 +267,7 @@ class IdentifiedRobot(TorqueRegression):
         """
         check_is_fitted(self)
         n_outputs = len(self._joints)
-        rows_x, targets = validate_numbers(self, X, y, reset=False, dtype=np.float64)
-        targets = np.asarray(targets, dtype=np.float64).reshape(len(rows_x), -1)
-        if targets.shape[1] != n_outputs:
-            raise ValueError(f"y has {targets.shape[1]} columns; the robot has {n_outputs} joints.")
-        check_magnitude(rows_x, "X")
-        check_magnitude(targets, "y")
+        rows_x, targets = self._new_log(X, y)
         if check_integer(link, "link", minimum=-n_outputs) >= n_outputs:
             raise ValueError(f"link={link} must be the index of one of the {n_outputs} links.")
         for name, value in (("mass_scale", mass_scale), ("size", size)):

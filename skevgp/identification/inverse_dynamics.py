@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
 
@@ -11,7 +12,7 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
 from sklearn.base import RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import Tags, check_random_state
+from sklearn.utils import Bunch, Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from ..estimators.summary import ModelSummary, html_of, of_inverse_dynamics
@@ -23,12 +24,14 @@ from ..robots.loading import Robot
 from ..utils.frames import FrameColumns
 from ..utils.shapes import like_y
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails, validate_numbers
+from ..utils.validation import check_magnitude, check_not_vanishing, check_real, unchanged_if_it_fails, validate_numbers
 from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
+from .log_check import check_of
 from .moves import of_move, terms
-from .weights import Rows, Fold, condensed, folds
+from .weaknesses import weaknesses
+from .weights import Fold, Rows, condensed, folds
 
 # Weights that differ from their prior by more prior standard deviations than this make the prior doubtful.
 _FAR = 4.0
@@ -114,6 +117,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         information of all rows is divided by it.
     stiction_velocity_ : ndarray of shape (n_outputs,)
         Speed below which the sign of friction is not known, rad/s or m/s.
+    move_scale_ : ndarray of shape (n_outputs, 4)
+        Standard deviations between moves: of the offset, of viscous friction, of Coulomb friction and of the relative
+        error of the gain.
+    move_ : ndarray of shape (n_outputs, 4)
+        These effects in the move that `update` was given, else 0.
     n_iter_ : int
         Largest number of iterations of an f_j.
     feature_map_ : transformer
@@ -246,19 +254,19 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         -----
         ConvergenceWarning
             If weights are far from the robot's model, for example because y has other units. If columns seem to be in
-            another order, angles in degrees, or positions beyond the limits of the model. If f_j of some joints is
-            valid for no left-out group; its signal is then nearly 0.
+            another order, angles in degrees, or positions beyond the limits of the model. If a joint never moves, or
+            has hardly any torque, or rows tell too little about the weights.
         RobotModelWarning
             If the model of the robot is unphysical, as in `skevgp.datasets.load_robot`.
         """
         with unchanged_if_it_fails(self):
-            doubt = self._fit(X, y, groups, pieces)
-        if doubt:
+            doubts = self._fit(X, y, groups, pieces)
+        for doubt in doubts:
             warn_user(doubt, ConvergenceWarning)
         return self
 
-    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> str:
-        """Fit, and return a message if the robot's model is in doubt."""
+    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> list[str]:
+        """Fit, and return warnings about the robot's model and the data."""
         rows_x: np.ndarray
         rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
@@ -283,10 +291,13 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         little = (missed > _LITTLE * variance) & (variance > 0.0)
         self._unexplained = [name for name, bad in zip(self._outputs, little, strict=True) if bad]
         is_doubtful = ((missed > _DOUBTFUL * variance) & (variance > 0.0)).any()
-        doubt = self._doubt(rows_x, targets, is_doubtful) if self._has_robot else ""
+        doubts = []
+        if self._has_robot:
+            doubts = [doubt] if (doubt := self._doubt(rows_x, targets, is_doubtful)) else []
+            doubts += weaknesses(rows, self._weights, self._outputs)
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()
-        return doubt
+        return doubts
 
     def _doubt(self, X: np.ndarray, y: np.ndarray, is_doubtful: bool | np.bool_) -> str:
         """Return a warning if the robot's model explains torques badly, or ""."""
@@ -359,6 +370,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])
         self.residual_std_ = np.array([joint.signal for joint in self._joints])
         self.residual_models_ = [joint.model for joint in self._joints]
+        self.move_scale_ = np.sqrt([np.diag(joint.effects.covariance) for joint in self._joints])
+        self.move_ = np.zeros_like(self.move_scale_)
         self.n_iter_ = max([1, *(model.n_iter_ for model in self.residual_models_ if model is not None)])
         self.correlation_time_ = weights.correlation_time
         self.inflation_ = weights.inflation
@@ -404,6 +417,128 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         return like_y(values) if self._one_dimensional else values
+
+    def update(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> Self:
+        """Adapt to the machine of today by some rows of a new log.
+
+        Friction changes with temperature, and sensors drift. Each joint has an offset, viscous friction, Coulomb
+        friction and gain of its own in each move, whose variances `fit` finds by left-out moves (``move_scale_``). A
+        few seconds of a new log determine them. Weights, f_j and noise stay.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈] in the order of time.
+        y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
+            Torques, in the units of `fit`.
+        pieces : array-like of shape (n_samples,), default=None
+            Labels of rows that follow each other without a gap, as in `fit`.
+
+        Returns
+        -------
+        self : InverseDynamics
+            The estimator itself. Predictions are those of the move of X. Another call begins anew.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If shapes do not fit or data are not finite.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> rng = np.random.default_rng(0)
+        >>> X, day = rng.normal(size=(900, 3)), np.arange(900) // 100
+        >>> torque = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.1 * rng.normal(size=900)
+        >>> offset = 0.5 * rng.normal(size=9)
+        >>> model = InverseDynamics("pendulum", n_inducing=0).fit(X, torque + offset[day], groups=day)
+        >>> before = model.predict(X)
+        >>> model.update(X[:50], torque[:50] + 1.0).predict(X).mean() - before.mean() > 0.8
+        True
+        """
+        check_is_fitted(self)
+        rows, missed, _, z = self._errors_of(X, y, pieces)
+        self._joints = [
+            replace(joint, move=of_move(joint.effects, z[j], missed[:, j], rows.speed[:, j], joint.noise, rows.runs))
+            for j, joint in enumerate(self._joints)
+        ]
+        self.move_ = np.array([joint.move.mean for joint in self._joints])
+        return self
+
+    def check_log(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        pieces: ArrayLike | None = None,
+        dt: float = 0.01,
+        false_alarms_per_minute: float = 0.01,
+    ) -> Bunch:
+        """Test whether a log is that of the machine of `fit`, without another load, a fault or contact.
+
+        Errors of the log are compared with errors of left-out moves at `fit`: their mean square, and the offset,
+        friction and gain that they are explained by. `update` does not count.
+
+        Parameters
+        ----------
+        X, y, pieces : array-like
+            The log, as in `update`.
+        dt : float, default=0.01
+            Time between rows, s.
+        false_alarms_per_minute : float, default=0.01
+            Rate of ordinary logs that are found not to fit, per minute of the log.
+
+        Returns
+        -------
+        check : Bunch
+            - ``fits`` : bool, whether the log fits;
+            - ``p_value`` : float, probability of an ordinary log that fits no better;
+            - ``p_values`` : ndarray of shape (n_joints,), the same for each joint alone;
+            - ``joints`` : list of str, joints that do not fit.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If shapes do not fit, data are not finite, or an argument is out of its range.
+
+        Notes
+        -----
+        With few moves at `fit` only large differences can be told from ordinary ones.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> rng = np.random.default_rng(0)
+        >>> X, day = rng.normal(size=(900, 3)), np.arange(900) // 100
+        >>> torque = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.1 * rng.normal(size=900)
+        >>> model = InverseDynamics("pendulum", n_inducing=0).fit(X, torque, groups=day)
+        >>> model.check_log(X[:300], torque[:300]).fits, model.check_log(X[:300], 1.1 * torque[:300]).joints
+        (True, ['q'])
+        """
+        check_is_fitted(self)
+        step = check_real(dt, "dt", minimum=0.0, strict=True)
+        rate = check_real(false_alarms_per_minute, "false_alarms_per_minute", minimum=0.0, strict=True)
+        rows, missed, std, z = self._errors_of(X, y, pieces)
+        probability = min(1.0, rate * len(missed) * step / 60.0)
+        return check_of(self._joints, self._outputs, missed, std, z, rows.runs, probability)
+
+    def _errors_of(
+        self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None
+    ) -> tuple[Rows, np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Return the rows of a new log, errors and std (n, o) for a move that no row is known of, and z of joints."""
+        rows_x, targets = self._new_log(X, y)
+        rows = self._as_rows(rows_x, targets, None, pieces)
+        physics = self._weights.predict(rows.features)
+        variance = self._weights.variance(rows.features)
+        missed, z = targets - physics, []
+        for j, joint in enumerate(self._joints):
+            z.append(terms(rows.speed[:, j], physics[:, j], joint.noise.velocity))
+            mean, own = joint.moments(self._own(rows_x, physics, j))
+            missed[:, j] -= mean
+            variance[:, j] += own + joint.effects.moments(z[j])[1] + joint.noise.of(rows.speed[:, j])
+        return rows, missed, np.sqrt(variance), z
 
     def summary(self) -> ModelSummary:
         """Summarise the fit: weights with their prior, noise, and the residual of each joint.

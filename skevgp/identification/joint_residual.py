@@ -57,6 +57,8 @@ class JointResidual:
     share: float
     effects: MoveEffects  # of a move that no row is known of, as moves differ
     move: MoveEffects  # of the move that rows are predicted of
+    # (moves,): log mean squares of the errors of left-out moves, in predicted standard deviations.
+    log_squares: np.ndarray
 
     @property
     def signal(self) -> float:
@@ -101,16 +103,20 @@ def fit_joint_residual(
         physics[fold.out] = fold.torques[fold.out]
         missed[fold.out] = (target - fold.torques)[fold.out]
 
-    def ended(model: QuietRegressor | None, share: float, missed: np.ndarray, found: JointNoise) -> JointResidual:
+    def ended(
+        model: QuietRegressor | None, share: float, missed: np.ndarray, found: JointNoise, own: np.ndarray | float = 0.0
+    ) -> JointResidual:
         z = terms(speed, physics, found.velocity)
         effects, found = variation(z, missed, speed, found, rows)
-        return JointResidual(model, found, share, effects, effects)
+        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own)
+        logs = [np.log(np.mean(squares[rows.groups == move])) for move in np.unique(rows.groups)]
+        return JointResidual(model, found, share, effects, effects, np.array(logs))
 
     size = float(np.mean(residual**2))
     found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, noise.variance)
     if size <= _NOTHING:
         nothing = MoveEffects.none()
-        return JointResidual(None, found, 0.0, nothing, nothing)
+        return JointResidual(None, found, 0.0, nothing, nothing, np.zeros(1))
     if not options["n_inducing"]:
         return ended(None, 0.0, missed, found)
     spread = x[some].std(axis=0)
@@ -137,8 +143,9 @@ def fit_joint_residual(
     model.fit(x[some], residual[some], relative_variance=relative[some])
     missed = missed - share * mean
     found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
-    own = share**2 * float(np.mean(variance / relative))
-    return ended(model, share, missed, found._replace(variance=max(found.variance - own, _OWN * found.variance)))
+    own = share**2 * variance
+    left = found.variance - float(np.mean(own / relative))
+    return ended(model, share, missed, found._replace(variance=max(left, _OWN * found.variance)), own)
 
 
 def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, folds: list[Fold]) -> float:

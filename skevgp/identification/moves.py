@@ -74,6 +74,16 @@ def of_move(
     return MoveEffects(*_posterior(np.diag(before.covariance), rows.T @ rows, rows.T @ (missed / scale)))
 
 
+def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the effects of a move by least squares, and their covariance."""
+    scale = std * np.sqrt(correlation_time(missed / std, runs))
+    rows = z / scale[:, np.newaxis]
+    size = np.sqrt(np.sum(rows**2, axis=0))
+    unit = np.where(size > 0.0, size, 1.0)
+    inverse = np.linalg.pinv((rows / unit).T @ (rows / unit), rcond=1e-8, hermitian=True) / np.outer(unit, unit)
+    return inverse @ (rows.T @ (missed / scale)), inverse
+
+
 def _posterior(variance: np.ndarray, information: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance of d ~ N(0, diag(variance)) given rows with information ZᵀZ and score Zᵀe."""
     # With d = √t u the precision of u is I + √t ZᵀZ √t, which no t makes singular.

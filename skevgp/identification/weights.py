@@ -38,8 +38,8 @@ class Rows:
     n_moves: int = 1  # number of trajectories that the user named
 
     def __getitem__(self, chosen: np.ndarray) -> Rows:
-        arrays = (getattr(self, name)[chosen] for name in self.__dataclass_fields__ if name != "n_moves")
-        return Rows(*arrays, self.n_moves)
+        arrays = {name: getattr(self, name)[chosen] for name in self.__dataclass_fields__ if name != "n_moves"}
+        return replace(self, **arrays)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ class Weights:
     # Distance of the weights from the prior mean in prior standard deviations: root mean square over the directions
     # that rows determine, near 1 if the prior is right.
     surprise: float
+    determined: float  # number of these directions
     # (P,): learned factors of the standard deviations of the prior as given. ``prior`` includes them.
     factors: np.ndarray
 
@@ -142,8 +143,10 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
     # In standard deviations of the prior as given.
     if start is not None:
         factors = factors * start.factors
-    surprise = float(np.sqrt(np.sum((factors * z) ** 2) / max(1.0, len(z) - np.trace(covariance))))
-    return Weights(mean, root @ covariance @ root.T, prior, state.noise, state.times, inflation, surprise, factors)
+    determined = float(len(z) - np.trace(covariance))
+    surprise = float(np.sqrt(np.sum((factors * z) ** 2) / max(1.0, determined)))
+    covariance = root @ covariance @ root.T
+    return Weights(mean, covariance, prior, state.noise, state.times, inflation, surprise, determined, factors)
 
 
 class Fold(NamedTuple):

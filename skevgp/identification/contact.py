@@ -1,0 +1,268 @@
+"""ContactMonitor: alarms for contact of a robot, with a stated rate of false alarms."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import solve_toeplitz
+from sklearn.utils.validation import NotFittedError, check_is_fitted
+
+from ..utils.validation import check_real, checked_groups
+from .inverse_dynamics import InverseDynamics
+
+# Durations of the pushes that the filters match, s. Filters see this many of the longest one.
+_PUSHES, _WINDOWS = (0.05, 0.15, 0.4), 2
+# Alarms within this time are one, s.
+_APART = 1.0
+# The tail of the statistic is that of the largest share of its maxima, which are at least so many.
+_TAIL, _FEWEST = 0.25, 8
+# Added to the variance of errors, as a share of it.
+_WHITE = 1e-3
+
+
+class ContactMonitor:
+    r"""Detect contact by the errors of a robot's torques, with a stated rate of false alarms.
+
+    Errors of a model of torques are correlated in time: friction and inertia are wrong for as long as a motion lasts.
+    For each joint and for pushes of 0.05 s, 0.15 s and 0.4 s, the matched filter of these errors,
+
+    .. math::
+
+        g = \frac{s^\top C^{-1} z}{\sqrt{s^\top C^{-1} s}}
+
+    sees a constant push s best, in errors z (in predicted standard deviations) with the covariance C of free motion.
+    There is an alarm when the largest :math:`|g|` is above a threshold. The threshold follows from the tail of its
+    maxima in free motion.
+
+    Parameters
+    ----------
+    model : InverseDynamics
+        Fitted model of the robot.
+    dt : float, default=0.01
+        Time between rows, s, which is constant.
+    false_alarms_per_hour : float, default=1.0
+        Expected number of false alarms in an hour of free motion. Alarms within a second are one.
+
+    Attributes
+    ----------
+    threshold_ : float
+        Largest statistic without an alarm.
+    scale_ : ndarray of shape (n_joints, 3)
+        Root mean square of each g in free motion.
+    detectable_ : ndarray of shape (n_joints,)
+        Torque of a push of 0.4 s that raises the statistic to the threshold, N m (N): a push twice as large is nearly
+        always found.
+    hours_ : float
+        Free motion that `fit` has seen, h.
+
+    See Also
+    --------
+    InverseDynamics.check_log : Does a whole log fit the model?
+
+    Notes
+    -----
+    Signals must be filtered as those that the model was fitted to. A filter without delay, as in
+    `skevgp.datasets.load_log`, sees the future; a causal filter delays alarms. The first 0.8 s after a gap have no
+    alarms.
+
+    References
+    ----------
+    - S. Haddadin, A. De Luca, A. Albu-Schäffer (2017): Robot Collisions: A Survey on Detection, Isolation, and
+      Identification.
+    - S. Coles (2001): An Introduction to Statistical Modeling of Extreme Values, chapter 4.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from skevgp import ContactMonitor, InverseDynamics
+    >>> rng, t = np.random.default_rng(0), np.arange(0.0, 180.0, 0.01)
+    >>> q, dq = np.sin(t) + 0.5 * np.sin(2.7 * t), np.cos(t) + 1.35 * np.cos(2.7 * t)
+    >>> X = np.column_stack([q, dq, -np.sin(t) - 3.645 * np.sin(2.7 * t)])
+    >>> y = X[:, 2] / 4 + 9.81 / 2 * np.sin(q) + 0.1 * rng.standard_normal(len(t))
+    >>> model = InverseDynamics("pendulum", n_inducing=0).fit(X[:6000], y[:6000])
+    >>> monitor = ContactMonitor(model).fit(X[6000:12000], y[6000:12000])
+    >>> pushed = y[12000:] + 0.3 * (np.arange(6000) // 20 == 100)  # 0.3 N m for 0.2 s
+    >>> alarms = monitor.predict(X[12000:], pushed)
+    >>> bool(alarms[2000:2040].any()), int(alarms[:2000].sum())
+    (True, 0)
+    """
+
+    _last: np.ndarray  # errors z of the last rows of a stream
+
+    def __init__(self, model: InverseDynamics, *, dt: float = 0.01, false_alarms_per_hour: float = 1.0):
+        self.model = model
+        self.dt = dt
+        self.false_alarms_per_hour = false_alarms_per_hour
+
+    def fit(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> Self:
+        """Find filters and threshold by free motion that the model was not fitted to.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈] without contact, in the order of time: some minutes.
+        y : array-like of shape (n_samples, n_joints)
+            Torques.
+        pieces : array-like of shape (n_samples,), default=None
+            Labels of rows that follow each other without a gap.
+
+        Returns
+        -------
+        self : ContactMonitor
+            Fitted.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument is out of its range, or no piece is as long as 16 seconds together with others.
+        """
+        check_is_fitted(self.model)
+        step = check_real(self.dt, "dt", minimum=0.0, strict=True)
+        rate = check_real(self.false_alarms_per_hour, "false_alarms_per_hour", minimum=0.0, strict=True)
+        z, std, runs = self._errors(X, y, pieces)
+        parts = [z[runs == run] for run in np.unique(runs)]
+        self._lengths = [max(1, round(push / step)) for push in _PUSHES]
+        self._window = _WINDOWS * self._lengths[-1]
+        parts = [part for part in parts if len(part) >= self._window]
+        self._filters = np.stack([self._matched(products) for products in self._covariances(parts, z.shape[1])])
+        self.scale_ = np.ones(self._filters.shape[:2])
+        filtered = [self._filtered(part) for part in parts]
+        block = max(1, round(_APART / step))
+        judged = sum(len(one) for one in filtered)
+        if judged < 2 * _FEWEST * block:
+            raise ValueError(
+                f"fit needs at least {2 * _FEWEST * block} rows of free motion, of which each piece has "
+                f"{self._window} before them; got {judged}."
+            )
+        together = np.concatenate(filtered)
+        scale = np.sqrt(np.mean(together**2, axis=0))
+        self.scale_ = np.where(scale > 0.0, scale, 1.0)
+        maxima = np.concatenate([_maxima(np.abs(one / self.scale_).max(axis=(1, 2)), block) for one in filtered])
+        self.hours_ = judged * step / 3600.0
+        self.threshold_ = _threshold(maxima, rate * self.hours_)
+        gain = np.abs(self._filters[:, -1, -self._lengths[-1] :].sum(axis=1)) / self.scale_[:, -1]
+        self.detectable_ = self.threshold_ * np.sqrt(np.mean(std**2, axis=0)) / gain
+        self.reset()
+        return self
+
+    def score_samples(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> np.ndarray:
+        """Return the statistic of rows.
+
+        Parameters
+        ----------
+        X, y, pieces : array-like
+            A log, as in `fit`.
+
+        Returns
+        -------
+        statistic : ndarray of shape (n_samples,)
+            Largest absolute g over joints and pushes, in root mean squares of free motion. The first 0.8 s of each
+            piece have 0.
+        """
+        self._check_fitted()
+        z, _, runs = self._errors(X, y, pieces)
+        found = np.zeros(len(z))
+        for run in np.unique(runs):
+            rows = np.flatnonzero(runs == run)
+            if len(rows) >= self._window:
+                found[rows[self._window - 1 :]] = np.abs(self._filtered(z[rows]) / self.scale_).max(axis=(1, 2))
+        return found
+
+    def predict(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> np.ndarray:
+        """Return which rows have an alarm.
+
+        Parameters
+        ----------
+        X, y, pieces : array-like
+            A log, as in `fit`.
+
+        Returns
+        -------
+        alarms : ndarray of bool of shape (n_samples,)
+            Whether the statistic of the row is above the threshold. It uses no later rows.
+        """
+        return self.score_samples(X, y, pieces=pieces) > self.threshold_
+
+    def step(self, x: ArrayLike, y: ArrayLike) -> bool:
+        """Return whether there is an alarm after the next row of a stream.
+
+        Parameters
+        ----------
+        x : array-like of shape (3 * n_joints,)
+            Row [q, q̇, q̈].
+        y : array-like of shape (n_joints,)
+            Torques.
+
+        Returns
+        -------
+        alarm : bool
+            The same as `predict` for all rows since `reset`.
+        """
+        self._check_fitted()
+        z, _, _ = self._errors(np.atleast_2d(np.asarray(x)), np.atleast_2d(np.asarray(y)), None)
+        self._last = np.concatenate([self._last, z])[-self._window :]
+        if len(self._last) < self._window:
+            return False
+        return bool(np.abs(self._filtered(self._last) / self.scale_).max() > self.threshold_)
+
+    def reset(self) -> None:
+        """Forget the rows of the stream, for example after a gap."""
+        self._last = np.zeros((0, len(self._filters)))
+
+    def _check_fitted(self) -> None:
+        if not hasattr(self, "threshold_"):
+            raise NotFittedError("This ContactMonitor is not fitted yet. Call fit with free motion first.")
+
+    def _errors(
+        self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return errors (n, o) in predicted std, std, and labels (n,) of rows without gaps."""
+        rows, targets = self.model._new_log(X, y)
+        mean, std = self.model.predict(rows, return_std=True)
+        std = std.reshape(targets.shape)
+        runs = checked_groups(pieces, len(rows), "pieces")
+        z = (targets - mean.reshape(targets.shape)) / std
+        return z, std, np.zeros(len(rows), dtype=int) if runs is None else runs
+
+    def _covariances(self, parts: list[np.ndarray], n_joints: int) -> np.ndarray:
+        """Return the autocovariance of each joint, (o, window)."""
+        found = np.zeros((n_joints, self._window))
+        for part in parts:
+            wave = np.fft.rfft(part, 2 * len(part), axis=0)
+            found += np.fft.irfft(wave * wave.conj(), 2 * len(part), axis=0)[: self._window].T
+        found /= max(1, sum(map(len, parts)))
+        found[:, 0] = np.where(found[:, 0] > 0.0, (1.0 + _WHITE) * found[:, 0], 1.0)
+        return found
+
+    def _matched(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the filters (pushes, window) of a joint, latest row last."""
+        filters = []
+        for length in self._lengths:
+            push = np.zeros(self._window)
+            push[-length:] = 1.0
+            solved = solve_toeplitz(covariance, push)
+            filters.append(solved / np.sqrt(push @ solved))
+        return np.array(filters)
+
+    def _filtered(self, z: np.ndarray) -> np.ndarray:
+        """Return g of rows (n, o) from the first full window on, (n - window + 1, o, pushes)."""
+        windows = np.lib.stride_tricks.sliding_window_view(z, self._window, axis=0)
+        found: np.ndarray = np.einsum("now,opw->nop", windows, self._filters, optimize=True)
+        return found
+
+
+def _maxima(values: np.ndarray, block: int) -> np.ndarray:
+    """Return the maximum of each block of rows."""
+    return np.array([part.max() for part in np.array_split(values, max(1, len(values) // block))])
+
+
+def _threshold(maxima: np.ndarray, wanted: float) -> float:
+    """Return the level that this number of maxima of blocks is expected to exceed."""
+    # Excesses over a high level are nearly exponential (Coles 2001, chapter 4). Those of logarithms are taken, a
+    # heavier tail, and their mean plus its standard error: free motion that `fit` has not seen may be of another kind.
+    count = min(len(maxima) - 1, max(_FEWEST, round(_TAIL * len(maxima))))
+    largest = np.sort(np.log(np.maximum(maxima, 1e-300)))[::-1]
+    level, excess = largest[count], float(np.mean(largest[:count] - largest[count])) * (1.0 + count**-0.5)
+    return float(np.exp(level + excess * max(0.0, np.log(count / wanted))))

@@ -1,0 +1,45 @@
+"""What a log cannot tell: joints at rest, joints without a motor, too little motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .weights import Rows, Weights
+
+# A joint whose torque is below this share of what the robot's model needs is not driven.
+_NOT_DRIVEN = 0.1
+# Least number of independent rows for each combination of weights that they determine.
+_ROWS_PER_WEIGHT = 3.0
+
+
+def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
+    """Return sentences on what the rows of a robot do not tell."""
+    said = []
+    prior = weights.prior
+    fastest = np.abs(rows.speed).max(axis=0)
+    still = fastest < prior.velocity
+    if still.any():
+        said.append(
+            f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s), so that their friction "
+            "and inertia stay those of the robot's model. Record motion of all joints."
+        )
+    needed = np.sqrt(np.mean((rows.features @ prior.mean[: weights.n_weights]) ** 2, axis=0))
+    torque = np.sqrt(np.mean(rows.targets**2, axis=0))
+    idle = (torque < _NOT_DRIVEN * needed) & ~still
+    if idle.any():
+        said.append(
+            f"Torques of {_of(names, idle)} are {100 * (torque / np.where(idle, needed, 1.0))[idle].max():.1f} % or less "
+            "of what the robot's model needs for this motion: either their motors were off, and the model will be "
+            "wrong where they are on, or the model's masses are far too large."
+        )
+    worth = float(np.sum(len(rows.targets) / weights.correlation_time))
+    if worth < _ROWS_PER_WEIGHT * weights.determined:
+        said.append(
+            f"Rows that follow each other are correlated: {rows.targets.size} torques tell as much as {worth:.0f} "
+            f"independent ones, for {weights.determined:.0f} combinations of weights. Record more motion."
+        )
+    return said
+
+
+def _of(names: list[str], chosen: np.ndarray) -> str:
+    return str([name for name, one in zip(names, chosen, strict=True) if one])
