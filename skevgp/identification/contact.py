@@ -59,7 +59,7 @@ class ContactMonitor:
 
     See Also
     --------
-    InverseDynamics.check_log : Does a whole log fit the model?
+    InverseDynamics.check_log : Test whether a whole log fits the model.
 
     Notes
     -----

@@ -20,17 +20,18 @@ def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
     still = fastest < prior.velocity
     if still.any():
         said.append(
-            f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s), so that their friction "
-            "and inertia stay those of the robot's model. Record motion of all joints."
+            f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s), so that nothing is "
+            "learned of their friction and inertia. Record motion of all joints."
         )
     needed = np.sqrt(np.mean((rows.features @ prior.mean[: weights.n_weights]) ** 2, axis=0))
     torque = np.sqrt(np.mean(rows.targets**2, axis=0))
     idle = (torque < _NOT_DRIVEN * needed) & ~still
     if idle.any():
+        share = 100.0 * (torque[idle] / needed[idle]).max()
         said.append(
-            f"Torques of {_of(names, idle)} are {100 * (torque / np.where(idle, needed, 1.0))[idle].max():.1f} % or less "
-            "of what the robot's model needs for this motion: either their motors were off, and the model will be "
-            "wrong where they are on, or the model's masses are far too large."
+            f"Torques of {_of(names, idle)} are at most {share:.1f} % of what the robot's model needs for this motion. "
+            "Either their motors were off, and the model will be wrong where they are on, or the masses of the robot's "
+            "model are far too large."
         )
     worth = float(np.sum(len(rows.targets) / weights.correlation_time))
     if worth < _ROWS_PER_WEIGHT * weights.determined:

@@ -1,0 +1,515 @@
+"""Torques, motion and contact of real and simulated machines, on moves that were not seen.
+
+    python benchmarks/machines.py inverse --data ../data           # twenty minutes of one core
+    python benchmarks/machines.py forward --data ../data           # twenty minutes of one core
+    python benchmarks/machines.py contact --data ../data           # two minutes of one core
+    python benchmarks/machines.py inverse --quick                  # simulated machines only, few rows: a minute
+
+The folder has the folders real (double_pendulum, simple_pendulum, kr300), ur10e and ur10, or some of them: machines
+without logs are left out, and the simulated ones need none. No row of the logs is written anywhere. A page of the
+documentation says how to add a machine.
+
+*inverse*: models of joint torques. Splits have moves to train on and moves to test on, whole. Least squares are the
+rigid-body features with friction, by `numpy.linalg.lstsq`. "updated" is `InverseDynamics` after `update` with the first
+third of each test move; its scores, and those of least squares that it is compared with, are of the rest.
+
+*forward*: models of the state after 20 ms, with `EVGPRegressor`'s defaults. Signals are filtered with 15 Hz. Rollouts
+are of a second, with the recorded torques, from 20 states of each test move.
+
+*contact*: `ContactMonitor` is fitted to clean moves that the model was not fitted to, and judged on another one.
+Simulated pushes are twice as large as ``detectable_`` and last 0.4 s.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.pipeline import make_union
+from sklearn.utils import Bunch
+
+import harness
+import robots
+from robots import LinearThenGP, LinearTorques, geometric
+from skevgp import ContactMonitor, EVGPRegressor, InverseDynamics, ResidualRegressor, rollout
+from skevgp.datasets import load_log, perturb_robot
+from skevgp.features import InertiaForce, InertiaForceGravity, NominalDynamics, RigidBodyRegressor
+from skevgp.metrics import containing_ratios, crps, negative_log_predictive_density
+
+# --- machines ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine: its URDF, a function that reads a move, and splits into moves to train on and to test on."""
+
+    robot: Callable[[Path], Any]
+    read: Callable[[str, Path, dict[str, Any]], Bunch]
+    splits: dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
+    signals: dict[str, Any] = field(default_factory=lambda: {"dt": 0.01, "cutoff": 5.0})
+
+
+def each_left_out(moves: tuple[str, ...]) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
+    return {f"without {move}": (tuple(other for other in moves if other != move), (move,)) for move in moves}
+
+
+def of_table(folder: str, columns: dict[str, Any]) -> Callable[[str, Path, dict[str, Any]], Bunch]:
+    def read(move: str, data: Path, signals: dict[str, Any]) -> Bunch:
+        return load_log(data / "real" / folder / f"{move}.csv.gz", columns=columns, **signals)
+
+    return read
+
+
+def columns_of(n_joints: int) -> dict[str, Any]:
+    names = {"position": "q", "velocity": "dq", "effort": "tau"}
+    return {"time": "time"} | {key: [f"{name}{j}" for j in range(1, n_joints + 1)] for key, name in names.items()}
+
+
+def own_urdf(folder: str) -> Callable[[Path], str]:
+    return lambda data: str(data / "real" / folder / "robot.urdf")
+
+
+def of_ur(robot: str) -> Callable[[str, Path, dict[str, Any]], Bunch]:
+    return lambda move, data, _: robots.log_of(robot, move, data)
+
+
+UR10E = ("20sec_8harm", "30sec_12harm", "40sec_12harm")
+UR10E_TESTS = ("20sec_7harm", "50sec_12harm", "14harm50sec", "ptp_10_points", "unload")
+DOUBLE = tuple(f"trajectory_{number}" for number in range(1, 7))
+SIMPLE = ("energy_shaping", "ilqr", "pd_system_identification", "sac")
+KR300 = {"A": (("A",), ("B",)), "B": (("B",), ("A",))}
+SIMULATED = {
+    "three moves": (("move 1", "move 2", "move 3"), ("move 4", "faster", "one joint at a time", "another day"))
+}
+
+
+@lru_cache
+def simulated(robot: str, move: str) -> Bunch:
+    """Return a move of a simulated arm whose friction depends on the load, and changes from day to day."""
+    kinds = {"faster": 4, "one joint at a time": 5, "another day": 6}
+    number = kinds.get(move) or int(move.split()[1])
+    rng, features = np.random.default_rng(number), RigidBodyRegressor(robot)
+    n = features.fit(np.zeros((1, 3 * robots.load_robot(robot).nv))).model_.nv
+    X = robots.trajectory(rng, n, "full")
+    if move == "faster":
+        X = X * np.repeat([1.0, 1.5, 2.25], n)  # as if time ran faster
+    if move == "one joint at a time":
+        X = X.reshape(len(X), 3, n) * (np.arange(len(X)) * n // len(X) == np.arange(n)[:, np.newaxis]).T[:, np.newaxis]
+        X = X.reshape(len(X), 3 * n)
+    model = perturb_robot(robot, 0.2, random_state=1)
+    body = RigidBodyRegressor(model).fit(X)
+    torque = body.transform(X)[:, :, : 10 * n] @ body.coef_prior(n)[0][: 10 * n]
+    largest = np.abs(torque).max(axis=0) + 1.0
+    speed = np.tanh(X[:, n : 2 * n] / 0.02)
+    day = 1.0 + 0.05 * rng.normal(size=n) + (0.2 if move == "another day" else 0.0)
+    friction = day * speed * (0.05 * largest + 0.1 * np.abs(torque)) + 0.05 * largest * X[:, n : 2 * n]
+    noise = 0.01 * largest * rng.normal(size=torque.shape)
+    return Bunch(data=X, target=torque + friction + noise + 0.01 * largest * rng.normal(size=n))
+
+
+def of_simulated(robot: str) -> Callable[[str, Path, dict[str, Any]], Bunch]:
+    return lambda move, _, __: simulated(robot, move)
+
+
+MACHINES = {
+    "UR10e": Machine(
+        lambda data: robots.urdf_of("ur10e", data),
+        of_ur("ur10e"),
+        {"three moves": (UR10E, UR10E_TESTS), "one move": (UR10E[1:2], UR10E_TESTS)},
+    ),
+    "UR10": Machine(
+        lambda _: "ur10",
+        of_ur("ur10"),
+        {"two thirds": (("exciting 1/3", "exciting 2/3"), ("exciting 3/3", "validation"))},
+    ),
+    "KR300": Machine(own_urdf("kr300"), of_table("kr300", columns_of(6)), KR300),
+    "double pendulum, 5 Hz": Machine(
+        own_urdf("double_pendulum"), of_table("double_pendulum", columns_of(2)), each_left_out(DOUBLE)
+    ),
+    "double pendulum, 15 Hz": Machine(
+        own_urdf("double_pendulum"),
+        of_table("double_pendulum", columns_of(2)),
+        each_left_out(DOUBLE),
+        {"dt": 0.01, "cutoff": 15.0},
+    ),
+    "simple pendulum": Machine(
+        own_urdf("simple_pendulum"),
+        of_table(
+            "simple_pendulum", {"time": "time", "position": "position", "velocity": "velocity", "effort": "torque"}
+        ),
+        each_left_out(SIMPLE),
+        {"dt": 0.01, "cutoff": 15.0},
+    ),
+    "ur5, simulated": Machine(lambda _: "ur5", of_simulated("ur5"), SIMULATED),
+    "iiwa14, simulated": Machine(lambda _: "iiwa14", of_simulated("iiwa14"), SIMULATED),
+}
+
+
+def there(machine: str, data: Path | None) -> bool:
+    """Return whether there are logs of a machine."""
+    if machine.endswith("simulated"):
+        return True
+    try:
+        train, _ = next(iter(MACHINES[machine].splits.values()))
+        return data is not None and MACHINES[machine].read(train[0], data, MACHINES[machine].signals) is not None
+    except (OSError, KeyError):
+        return False
+
+
+def rows_of(machine: str, moves: tuple[str, ...], data: Path | None, size: str, **signals: Any) -> Bunch:
+    """Return rows of some moves, each of which is a group. A quick run takes every tenth row."""
+    own, step = MACHINES[machine], 10 if size == "quick" else 1
+    logs = [own.read(move, data or Path(), own.signals | signals) for move in moves]
+    targets = [np.asarray(log.target).reshape(len(log.data), -1)[::step] for log in logs]
+    return Bunch(
+        data=np.concatenate([log.data[::step] for log in logs]),
+        target=np.concatenate(targets),
+        groups=np.concatenate([np.full(len(target), number) for number, target in enumerate(targets)]),
+        pieces=[np.asarray(log.get("pieces", np.zeros(len(log.data), dtype=int))) for log in logs],
+        logs=logs,
+    )
+
+
+# --- inverse dynamics ----------------------------------------------------------------------------------------------
+
+Inverse = namedtuple("Inverse", "robot split model size")
+
+LEAST_SQUARES, OURS, UPDATED = "least squares", "InverseDynamics", "InverseDynamics, updated"
+INVERSE = (
+    "URDF",
+    LEAST_SQUARES,
+    "least squares, then GP",
+    "GP",
+    "gradient boosting",
+    "InverseDynamics without GP",
+    OURS,
+    UPDATED,
+)
+
+
+def inverse_model(name: str, robot: Any, quick: bool) -> tuple[Any, bool, bool]:
+    """Return a regressor with its defaults, whether it has a std, and whether its fit takes groups."""
+    short = {"max_iter": 5} if quick else {}
+    gp = EVGPRegressor(n_inducing=10 if quick else 100, random_state=0, **short)
+    ours = InverseDynamics(robot, random_state=0, **short)
+    boosting = HistGradientBoostingRegressor(random_state=0, **short)
+    return {
+        "URDF": (LinearTorques(robot, least_squares=False), True, False),
+        LEAST_SQUARES: (LinearTorques(robot), True, False),
+        "least squares, then GP": (LinearThenGP(LinearTorques(robot), gp), True, True),
+        "GP": (gp, True, True),
+        "gradient boosting": (MultiOutputRegressor(boosting), False, False),
+        "InverseDynamics without GP": (InverseDynamics(robot, n_inducing=0), True, True),
+        OURS: (ours, True, True),
+        UPDATED: (ours, True, True),
+    }[name]
+
+
+def run_inverse(cell: Inverse, data: Path | None) -> list[dict[str, Any]]:
+    """Fit a model and judge each joint on each test move."""
+    machine = MACHINES[cell.robot]
+    robot, (trained, tested) = machine.robot(data or Path()), machine.splits[cell.split]
+    train = rows_of(cell.robot, trained, data, cell.size)
+    model, has_std, by_groups = inverse_model(cell.model, robot, cell.size == "quick")
+    groups = {"groups": train.groups} if by_groups else {}
+    y = train.target if train.target.shape[1] > 1 or cell.model in INVERSE[:3] else train.target.ravel()
+    if cell.model == "gradient boosting":
+        y = train.target
+    seconds, _ = harness.timed(lambda: model.fit(train.data, y, **groups))
+    base, found = LinearTorques(robot).fit(train.data, train.target), []
+    for move in tested:
+        test = rows_of(cell.robot, (move,), data, cell.size)
+        X, truth = test.data, test.target
+        if cell.model == UPDATED:
+            first = len(X) // 3
+            model.update(X[:first], truth[:first] if truth.shape[1] > 1 else truth[:first].ravel())
+            X, truth = X[first:], truth[first:]
+        least = np.mean((base.predict(X) - truth) ** 2, axis=0)
+        mean, std = model.predict(X, return_std=True) if has_std else (model.predict(X), None)
+        mean = np.reshape(mean, truth.shape)
+        errors, variance = np.mean((mean - truth) ** 2, axis=0), truth.var(axis=0)
+        for joint in range(truth.shape[1]):
+            row = {"test": move, "joint": joint + 1}
+            row |= {"nmse": errors[joint] / variance[joint], "least": least[joint] / variance[joint]}
+            row |= dict.fromkeys(("cr1", "cr2", "cr3", "nlpd", "crps"), "")
+            if std is not None:
+                own = truth[:, [joint]], mean[:, [joint]], np.reshape(std, truth.shape)[:, [joint]]
+                row |= dict(zip(("cr1", "cr2", "cr3"), containing_ratios(*own), strict=True))
+                row |= {"nlpd": negative_log_predictive_density(*own) - 0.5 * np.log(variance[joint])}
+                row["crps"] = crps(*own) / np.sqrt(variance[joint])
+            found.append({**row, "n_train": len(train.data), "n_test": len(truth), "fit_seconds": seconds})
+    return found
+
+
+def inverse_tables(rows: pd.DataFrame) -> harness.Tables:
+    """Return a line for each machine, then for each test move, and errors of all models."""
+    rows = rows.assign(ratio=rows["nmse"] / rows["least"])
+    moves = rows.groupby(["robot", "split", "test", "model"], sort=False).agg(
+        ratio=("ratio", geometric), nmse=("nmse", geometric), cr2=("cr2", "mean"), least_cr2=("cr2", "min")
+    )
+    moves = moves.reset_index()
+    names = [name for name in MACHINES if (rows["robot"] == name).any()]
+    lines = []
+    for machine in names:
+        own = moves[(moves["robot"] == machine) & (moves["model"] == OURS)]
+        joints = rows[(rows["robot"] == machine) & (rows["model"] == OURS)]
+        updated = moves[(moves["robot"] == machine) & (moves["model"] == UPDATED)]
+        lines.append(
+            {
+                "machine": machine,
+                "test moves": len(own),
+                "error / least squares": geometric(own["ratio"]),
+                "largest": own["ratio"].max(),
+                "CR-2": f"{own['cr2'].mean():.3f}",
+                "least of a joint": f"{joints.groupby('joint')['cr2'].mean().min():.3f}",
+                "updated: error / least squares": geometric(updated["ratio"]) if len(updated) else np.nan,
+                "seconds": joints.groupby("split")["fit_seconds"].first().mean(),
+            }
+        )
+    models = moves.groupby(["model", "robot"], sort=False)["ratio"].agg(geometric).unstack()
+    models = models.reindex(index=harness.ordered(INVERSE, moves["model"]), columns=names)
+    ours = moves[moves["model"] == OURS]
+    table = ours.assign(cr2=harness.text(ours["cr2"], 3), least_cr2=harness.text(ours["least_cr2"], 3))
+    names = {"robot": "machine", "split": "trained on", "test": "move", "ratio": "error / least squares"}
+    names |= {"nmse": "nMSE", "cr2": "CR-2", "least_cr2": "least of a joint"}
+    table = table.drop(columns="model").rename(columns=names)
+    return {"machines": pd.DataFrame(lines), "models": models.reset_index(names=""), "moves": table}
+
+
+# --- forward dynamics ----------------------------------------------------------------------------------------------
+
+Forward = namedtuple("Forward", "robot split model size")
+
+STEP, ROLLOUT_STEPS, STARTS, PARTICLES = 0.02, 50, 20, 50
+FORWARD = ("plain", "RES", "IF", "IFG", "IF and nominal")
+
+
+def transitions(rows: Bunch) -> Bunch:
+    """Return [q, q̇, u] and the next [q, q̇] of rows that follow each other, and where pieces start."""
+    X, Y, groups, starts = [], [], [], []
+    for number, (log, pieces) in enumerate(zip(rows.logs, rows.pieces, strict=True)):
+        n = np.asarray(log.target).reshape(len(log.data), -1).shape[1]
+        state, torque = log.data[:, : 2 * n], np.asarray(log.target).reshape(-1, n)
+        follows = pieces[1:] == pieces[:-1]
+        X.append(np.column_stack([state, torque])[:-1][follows])
+        Y.append(state[1:][follows])
+        groups.append(np.full(int(follows.sum()), number))
+        starts.append(pieces[:-1][follows])
+    return Bunch(data=np.concatenate(X), target=np.concatenate(Y), groups=np.concatenate(groups), pieces=starts)
+
+
+def forward_model(name: str, robot: Any, quick: bool) -> Any:
+    short = {"max_iter": 5, "n_inducing": 10} if quick else {}
+    features = {
+        "plain": None,
+        "RES": None,
+        "IF": InertiaForce(robot, dt=STEP),
+        "IFG": InertiaForceGravity(robot, dt=STEP),
+        "IF and nominal": make_union(InertiaForce(robot, dt=STEP), NominalDynamics(robot, dt=STEP)),
+    }[name]
+    model = EVGPRegressor(features, random_state=0, **short)
+    return ResidualRegressor(model) if name == "RES" else model
+
+
+def run_forward(cell: Forward, data: Path | None) -> list[dict[str, Any]]:
+    """Fit a model of the next state, and judge one step and rollouts of each test move."""
+    machine = MACHINES[cell.robot]
+    robot, (trained, tested) = machine.robot(data or Path()), machine.splits[cell.split]
+    train = transitions(rows_of(cell.robot, trained, data, cell.size, dt=STEP))
+    model = forward_model(cell.model, robot, cell.size == "quick")
+    seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, groups=train.groups))
+    found = []
+    for move in tested:
+        test = transitions(rows_of(cell.robot, (move,), data, cell.size, dt=STEP))
+        n = test.target.shape[1]
+        mean, std = model.predict(test.data, return_std=True)
+        change = test.target - test.data[:, :n]
+        error = np.mean((mean - test.target) ** 2, axis=0) / change.var(axis=0)
+        row = {
+            "test": move,
+            "nmse": float(np.exp(np.mean(np.log(error)))),
+            "cr2": containing_ratios(test.target, mean, std)[1],
+        }
+        row |= covered(model, test, n)
+        found.append({**row, "n_train": len(train.data), "n_test": len(test.data), "fit_seconds": seconds})
+    return found
+
+
+def covered(model: Any, test: Bunch, n: int) -> dict[str, float]:
+    """Return shares of states within two standard deviations of rollouts, and the error of positions at the end."""
+    steps = min(ROLLOUT_STEPS, len(test.data) // 4)
+    pieces, first = test.pieces[0], np.linspace(0, len(test.data) - steps - 1, STARTS).astype(int)
+    first = first[pieces[first] == pieces[first + steps - 1]]
+    states = np.stack([test.target[start : start + steps] for start in first])
+    inputs = np.stack([test.data[start : start + steps, n:] for start in first])
+    shares: dict[str, float] = {}
+    for method, options in (("sample", {"n_samples": PARTICLES, "random_state": 0}), ("linearized", {})):
+        path = rollout(model, test.data[first, :n], inputs, method=method, **options)
+        inside = np.abs(path.mean - states) <= 2.0 * path.std
+        shares[f"covered_{method}"] = float(inside.mean())
+        scatter = test.data[:, : n // 2].std(axis=0)
+        shares[f"rollout_{method}"] = float(
+            np.median(np.linalg.norm((path.mean[:, -1] - states[:, -1])[:, : n // 2] / scatter, axis=1))
+        )
+    return shares
+
+
+def forward_tables(rows: pd.DataFrame) -> harness.Tables:
+    groups = rows.groupby(["robot", "model"], sort=False)
+    table = groups.agg(
+        nmse=("nmse", geometric),
+        cr2=("cr2", "mean"),
+        sample=("covered_sample", "mean"),
+        linearized=("covered_linearized", "mean"),
+        error=("rollout_sample", geometric),
+        seconds=("fit_seconds", "mean"),
+    ).reset_index()
+    table["nmse"] = table.groupby("robot")["nmse"].transform(harness.best)
+    for name in ("cr2", "sample", "linearized"):
+        table[name] = harness.text(table[name], 3)
+    names = {"nmse": "nMSE of the change", "cr2": "CR-2", "sample": "rollouts within 2 std", "linearized": "linearized"}
+    return {"forward": table.rename(columns=names | {"robot": "machine", "error": "error of rollouts"})}
+
+
+# --- contact -------------------------------------------------------------------------------------------------------
+
+Contact = namedtuple("Contact", "robot move rate size")
+
+RATES, PUSHES, PUSH_ROWS, BEFORE, APART = (6.0, 20.0, 60.0), 20, 40, 150, 100
+
+
+def run_contact(cell: Contact, data: Path | None) -> dict[str, Any]:
+    """Judge a monitor on a clean move, and on pushes in it. It is fitted to the other clean moves."""
+    machine = MACHINES[cell.robot]
+    trained, tested = next(iter(machine.splits.values()))
+    if cell.robot.startswith(("double", "simple")):  # as many moves to calibrate with as to train on
+        trained, tested = trained[: len(trained) // 2], trained[len(trained) // 2 :] + tested
+    others = tuple(move for move in tested if move != cell.move)
+    train, clean, test = (rows_of(cell.robot, moves, data, "full") for moves in (trained, others, (cell.move,)))
+    with harness.one_thread():
+        model = InverseDynamics(machine.robot(data or Path()), random_state=0)
+        model.fit(train.data, train.target, groups=train.groups)
+        monitor = ContactMonitor(model, false_alarms_per_hour=cell.rate)
+        monitor.fit(clean.data, clean.target, pieces=clean.groups)
+        alarms = np.flatnonzero(monitor.predict(test.data, test.target))
+        found, rng = 0, np.random.default_rng(0)
+        for _ in range(PUSHES):
+            joint, start = rng.integers(test.target.shape[1]), rng.integers(BEFORE, len(test.data) - PUSH_ROWS - 20)
+            rows = slice(start - BEFORE, start + PUSH_ROWS + 20)
+            pushed = test.target[rows].copy()
+            pushed[BEFORE : BEFORE + PUSH_ROWS, joint] += 2.0 * monitor.detectable_[joint] * rng.choice([-1.0, 1.0])
+            found += bool(monitor.predict(test.data[rows], pushed)[BEFORE:].any())
+    return {
+        "hours": len(test.data) * monitor.dt / 3600.0,
+        "false_alarms": 0 if len(alarms) == 0 else 1 + int(np.sum(np.diff(alarms) > APART)),
+        "pushes": PUSHES,
+        "found": found,
+        "threshold": monitor.threshold_,
+        "detectable": " ".join(f"{value:.3g}" for value in monitor.detectable_),
+        "hours_seen": monitor.hours_,
+    }
+
+
+def contact_tables(rows: pd.DataFrame) -> harness.Tables:
+    sums = rows.groupby(["robot", "rate"], sort=False)[["hours", "false_alarms", "pushes", "found"]].sum()
+    rate = sums.index.get_level_values("rate").to_numpy()
+    table = pd.DataFrame(
+        {
+            "minutes": 60.0 * sums["hours"],
+            "false alarms expected": sums["hours"] * rate,
+            "seen": sums["false_alarms"],
+            "pushes found": (sums["found"] / sums["pushes"]).map("{:.2f}".format),
+        }
+    ).reset_index(names=["machine", "per hour"])
+    largest = rows.groupby(["robot", "rate"], sort=False)["detectable"].first()
+    return {"contact": table.assign(**{"found by half, N m": largest.to_numpy()})}
+
+
+# --- the command ---------------------------------------------------------------------------------------------------
+
+
+def contact_cells(machine: str, size: str) -> list[Contact]:
+    trained, tested = next(iter(MACHINES[machine].splits.values()))
+    if machine.startswith(("double", "simple")):
+        tested = trained[len(trained) // 2 :] + tested
+    if len(tested) < 2:
+        return []
+    moves, rates = (tested[:1], RATES[-1:]) if size == "quick" else (tested, RATES)
+    return [Contact(machine, move, rate, size) for move in moves for rate in rates]
+
+
+def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
+    if part == "contact":
+        return [
+            cell for machine in machines if machine != "double pendulum, 15 Hz" for cell in contact_cells(machine, size)
+        ]
+    if part == "forward":
+        machines = [machine for machine in machines if machine in ("double pendulum, 15 Hz", "simple pendulum")]
+        return [Forward(m, split, model, size) for m in machines for split in MACHINES[m].splits for model in FORWARD]
+    return [Inverse(m, split, model, size) for m in machines for split in MACHINES[m].splits for model in INVERSE]
+
+
+PARTS = {  # CSV, function, tables, title
+    "inverse": ("machines", run_inverse, inverse_tables, "Torques of machines"),
+    "forward": ("machines_forward", run_forward, forward_tables, "Motion of machines"),
+    "contact": ("machines_contact", run_contact, contact_tables, "Contact"),
+}
+
+
+def plot(rows: pd.DataFrame, path: Path) -> None:
+    """Draw errors over those of least squares, and shares within two standard deviations, of each test move."""
+    rows = rows.assign(ratio=rows["nmse"] / rows["least"])
+    moves = rows.groupby(["robot", "split", "test", "model"], sort=False)
+    moves = moves.agg(ratio=("ratio", geometric), cr2=("cr2", "mean")).reset_index()
+    names = [name for name in MACHINES if (moves["robot"] == name).any()]
+    figure, (errors, shares) = harness.pyplot().subplots(
+        1, 2, figsize=(harness.WIDTH, 0.9 + 0.42 * len(names)), sharey=True, layout="constrained"
+    )
+    for number, model in enumerate(("InverseDynamics without GP", OURS)):
+        for place, machine in enumerate(names):
+            own = moves[(moves["robot"] == machine) & (moves["model"] == model)]
+            height = np.full(len(own), place + 0.18 * (2 * number - 1))
+            options = {"color": harness.PALETTE[number], "alpha": 0.7, "label": model if place == 0 else None}
+            errors.plot(own["ratio"], height, "o", markersize=4, **options)
+            shares.plot(own["cr2"], height, "o", markersize=4, **options)
+    errors.set(yticks=range(len(names)), yticklabels=names, xlabel="error / least squares', each test move")
+    errors.invert_yaxis()
+    errors.axvline(1.0, color="0.5", linewidth=0.8)
+    harness.logarithmic(errors, "x")
+    shares.axvspan(0.92, 0.98, color="0.9", zorder=0)
+    shares.axvline(0.954, color="0.5", linewidth=0.8)
+    shares.set_xlabel("share of rows within ± 2 std")
+    harness.legend(figure, ncols=2)
+    harness.save_picture(figure, path)
+
+
+def main() -> None:
+    parser = harness.argument_parser(__doc__, quick="simulated machines, every tenth row, few iterations")
+    parser.add_argument("part", choices=PARTS)
+    parser.add_argument("--data", type=Path, help="the folder of logs; default: simulated machines only")
+    parser.add_argument("--machines", nargs="+", choices=MACHINES, default=list(MACHINES), help="default: all")
+    options = harness.parse(parser)
+    name, run, tables_of, title = PARTS[options.part]
+    output = harness.output_path(options, name)
+    data = options.data.resolve() if options.data else None
+    machines = [machine for machine in options.machines if there(machine, data)]
+    cells = cells_of(options.part, machines, options.size)
+    n_failures = harness.run_missing(cells, partial(run, data=data), output, options.jobs) if cells else 0
+    rows = harness.frame(output, size=options.size)
+    if not len(rows):
+        raise SystemExit(f"There are no logs for {options.part} in {options.data}.")
+    if options.part == "inverse":
+        plot(rows, output.with_suffix(".png"))
+    harness.write_page(title, tables_of(rows), output, n_failures)
+
+
+if __name__ == "__main__":
+    main()
