@@ -106,9 +106,10 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     return model if joints is None else _with_locked(model, joints)
 
 
-def known_robot(robot: Robot) -> Any:
+def known_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     """A robot as `load_robot` gives it, without warnings: for who loads it a second time, or needs no inertia."""
-    return _read(robot)[0]
+    model = _read(robot)[0]
+    return model if joints is None else _with_locked(model, joints)
 
 
 def _read(robot: Robot) -> tuple[Any, list[str]]:
