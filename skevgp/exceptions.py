@@ -56,10 +56,11 @@ class InconsistentVersionWarning(UserWarning):
 
 
 class RobotModelWarning(UserWarning):
-    """The file or model of a robot has unphysical numbers.
+    """The file, the model or a log of a robot has unphysical numbers.
 
     `skevgp.datasets.load_robot`, and everything that loads a robot, gives it for moments of inertia that violate the
     triangle inequality, and for numbers of a URDF file that are not used, such as a negative effort limit.
+    `skevgp.datasets.load_log` gives it for efforts that lag behind positions, if it estimates their delay.
 
     See Also
     --------

@@ -114,6 +114,13 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
                 hint = "; the last one, dt, is the time step of each row in seconds."
             elif self.n_features_in_ == len(wanted) + 1:
                 hint = '; if there is one more, the time step of each row, say dt="column".'
+            n_columns = self.n_features_in_ - self._timed
+            # Joints with a motor have three columns each, also the accelerations of `RigidBodyRegressor`.
+            if 0 < n_columns < 3 * self._layout.n_joints and n_columns % 3 == 0:
+                hint += (
+                    " If only some joints were recorded, give the robot as load_robot(robot, joints=[...]), which "
+                    "locks the others."
+                )
             raise ValueError(
                 f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
                 f"{self._layout.name!r} needs {len(wanted)}: {wanted}{hint}"

@@ -6,7 +6,7 @@ import importlib.metadata
 import os
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
@@ -26,12 +26,13 @@ _COLLECTION = "example-robot-data"
 _MOST_TOLD = 4
 _MOVABLE = ("revolute", "continuous", "prismatic")
 _LIMITS = ("upperEffortLimit", "lowerEffortLimit", "velocityLimit")
+_OF_VELOCITIES = ("armature", "damping", "friction", "rotorInertia", "rotorGearRatio", *_LIMITS)
 _AXIS_TOLERANCE = 1e-6
 
 Robot = Any  # str | os.PathLike | System | pinocchio.Model: Pinocchio may not be there to name its type
 
 
-def load_robot(robot: Robot) -> Any:
+def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     """A robot as a Pinocchio model.
 
     Parameters
@@ -40,6 +41,10 @@ def load_robot(robot: Robot) -> Any:
         One of `list_robots`: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``,
         ``"acrobot"``, ``"iiwa14"``) or, with the package example-robot-data, one of its robots (``"panda"``,
         ``"ur5"``, ...); the path of a URDF file; or a model, which is checked.
+    joints : sequence of str, default=None
+        Names of the joints that move, in the order of the robot: those that a log has, for example. All other joints
+        are locked at position 0 (rad or m), or at the limit nearest to 0 if 0 is outside of their limits. Their links
+        become part of the link before them. If None, all joints move.
 
     Returns
     -------
@@ -60,7 +65,9 @@ def load_robot(robot: Robot) -> Any:
         number of the model makes no sense (not finite, a negative mass, armature, damping or dry friction, an axis
         that is not of length 1 or, in a file, has no direction, negative masses of fixed links that are not smaller
         than the mass that they are fixed to). If moments of inertia are so far below 0 that the mass matrix is not
-        positive definite. The message names the joint or the link, and the number.
+        positive definite. The message names the joint or the link, and the number. If ``joints`` is empty, has a name
+        twice, a name that the robot does not have, or another order than the robot, or if none of ``joints`` has a
+        motor.
     TypeError
         If ``robot`` is none of the above.
 
@@ -86,16 +93,23 @@ def load_robot(robot: Robot) -> Any:
     (2, ['q1', 'q2'])
     >>> model.damping
     array([0.1, 0.1])
+
+    The elbow alone, with the shoulder locked:
+
+    >>> elbow = load_robot("acrobot", joints=["q2"])
+    >>> elbow.nq, list(elbow.names)[1:]
+    (1, ['q2'])
     """
     model, warnings = _read(robot)
     for warning in warnings:
         warn_user(warning, RobotModelWarning)
-    return model
+    return model if joints is None else _with_locked(model, joints)
 
 
-def known_robot(robot: Robot) -> Any:
+def known_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     """A robot as `load_robot` gives it, without warnings: for who loads it a second time, or needs no inertia."""
-    return _read(robot)[0]
+    model = _read(robot)[0]
+    return model if joints is None else _with_locked(model, joints)
 
 
 def _read(robot: Robot) -> tuple[Any, list[str]]:
@@ -338,7 +352,7 @@ def _plain(model: Any, called: str, possible_links: Container[str] = ()) -> tupl
         if not abs(length - 1.0) <= _AXIS_TOLERANCE:
             raise ValueError(f"{called} has the joint {name!r} with an axis of length {length:g}; it must be 1.")
     _check_numbers(model, called)
-    plain = model if model.nq == model.nv else _with_angles(model)
+    plain = model if model.nq == model.nv else _rebuilt(model, range(1, model.njoints))
     return plain, check_bodies(plain, called, _names_of_links(model), possible_links)
 
 
@@ -384,22 +398,68 @@ def _check_numbers(model: Any, called: str) -> None:
         )
 
 
-def _with_angles(model: Any) -> Any:
-    """A copy without joints whose position is kept as (cos, sin)."""
+def _with_locked(model: Any, joints: Sequence[str]) -> Any:
+    """A copy of a plain model in which only these joints move; or a ValueError."""
+    called, names = f"The robot {model.name!r}", list(model.names)[1:]
+    if (
+        not isinstance(joints, (list, tuple, np.ndarray))
+        or not len(joints)
+        or not all(isinstance(name, str) for name in joints)
+    ):
+        raise ValueError(f"joints must be a list of names, at least one; got {joints!r}.")
+    if unknown := [name for name in joints if name not in names]:
+        close = [repr(name) for name in get_close_matches(unknown[0], names, n=3)]
+        hint = f" Did you mean {' or '.join(close)}?" if close else ""
+        raise ValueError(f"{called} has no joints {unknown}.{hint} Its joints are {names}.")
+    ordered = [name for name in names if name in joints]
+    if ordered != list(joints):
+        raise ValueError(f"joints must name each joint once, in the order of the robot {ordered}; got {list(joints)}.")
+    numbers = [1 + names.index(name) for name in ordered]
+    driven = [names[joint] for joint in np.flatnonzero(effort_limits(model).any(axis=0))]
+    if not set(driven) & set(ordered):
+        raise ValueError(f"None of joints={ordered} has a motor. The joints with a motor are {driven}.")
+    return model if ordered == names else _rebuilt(model, numbers)
+
+
+def _rebuilt(model: Any, moving: Sequence[int]) -> Any:
+    """A copy in which only some joints move, by their numbers, and a continuous joint that moves has an angle.
+
+    The other joints must have one position each, in which they are locked as near to 0 as their limits allow.
+    """
     pin = require("pinocchio", "Loading a robot")
     copy = pin.Model()
     copy.name, copy.gravity = model.name, model.gravity
-    bounded = np.ones(model.nv, dtype=bool)
-    for index in range(1, model.njoints):
-        joint = model.joints[index]
-        if joint.nq == 2:
-            bounded[joint.idx_v] = False
-            joint = pin.JointModelRevoluteUnaligned(_axis(joint)[3:])
-        copy.addJoint(model.parents[index], joint, model.jointPlacements[index], model.names[index])
-        copy.inertias[index] = model.inertias[index]
-    for name in ("armature", "damping", "friction", *_LIMITS):
-        setattr(copy, name, getattr(model, name))
-    positions = np.array([joint.idx_q for joint in list(model.joints)[1:]])
-    copy.lowerPositionLimit = np.where(bounded, model.lowerPositionLimit[positions], -np.inf)
-    copy.upperPositionLimit = np.where(bounded, model.upperPositionLimit[positions], np.inf)
+    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
+    locked = np.where(lower <= upper, np.clip(0.0, lower, upper), 0.0)
+    # The joint of the copy that moves with each joint of the model, and the place of the latter in it.
+    places = [(0, pin.SE3.Identity())]
+    for number in range(1, model.njoints):
+        joint, body = model.joints[number], model.inertias[number]
+        parent, place = places[model.parents[number]]
+        place = place * model.jointPlacements[number]
+        if number in moving:
+            own = joint if joint.nq == 1 else pin.JointModelRevoluteUnaligned(_axis(joint)[3:])
+            index = copy.addJoint(parent, own, place, model.names[number])
+            copy.inertias[index] = body
+            places.append((index, pin.SE3.Identity()))
+        else:
+            data = joint.createData()
+            joint.calc(data, locked)
+            places.append((parent, place * data.M))
+            copy.appendBodyToJoint(parent, body, places[number][1])
+    for frame in list(model.frames)[1:]:
+        index, place = places[frame.parentJoint]
+        is_locked = frame.type == pin.FrameType.JOINT and frame.parentJoint not in moving
+        kind = pin.FrameType.FIXED_JOINT if is_locked else frame.type
+        # Inertias of frames are part of those of the joints.
+        copy.addFrame(
+            pin.Frame(frame.name, index, frame.parentFrame, place * frame.placement, kind, frame.inertia), False
+        )
+    joints = [model.joints[number] for number in moving]
+    velocities, positions = [joint.idx_v for joint in joints], [joint.idx_q for joint in joints]
+    for name in _OF_VELOCITIES:
+        setattr(copy, name, np.array(getattr(model, name))[velocities])
+    bounded = np.array([joint.nq == 1 for joint in joints])
+    copy.lowerPositionLimit = np.where(bounded, lower[positions], -np.inf)
+    copy.upperPositionLimit = np.where(bounded, upper[positions], np.inf)
     return copy

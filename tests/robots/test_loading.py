@@ -1,5 +1,6 @@
 import dataclasses
 import importlib.metadata
+import pickle
 import re
 from pathlib import Path
 
@@ -8,7 +9,10 @@ import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from skevgp.robots import SYSTEMS, System, get_system, layout_of, list_robots, load_robot, loading
+from skevgp import InverseDynamics
+from skevgp.datasets import make_dynamics
+from skevgp.features import RigidBodyRegressor
+from skevgp.robots import SYSTEMS, RigidBody, System, get_system, layout_of, list_robots, load_robot, loading
 
 JOINT = """
   <joint name="{name}" type="{kind}">
@@ -106,6 +110,94 @@ def test_continuous_joint_has_an_angle(chain):
     assert_array_equal(model.lowerPositionLimit, [-1.0, -np.inf, -1.0])
     assert_array_equal(model.upperPositionLimit, [2.0, np.inf, 2.0])
     assert_array_equal(model.upperEffortLimit, [5.0, 7.0, 0.0])
+
+
+# --- joints that are locked ----------------------------------------------------------------------------------------
+
+KINOVA = "j2s6s200_joint_"
+ARM = [f"panda_joint{number}" for number in range(1, 8)]
+
+
+def numbered(model):
+    """The model with other numbers at each joint, and a gravity of its own."""
+    model = model.copy()
+    for start, name in enumerate(PER_JOINT, start=1):
+        setattr(model, name, 10.0 * start + np.arange(model.nv))
+    model.lowerEffortLimit = -np.array(model.upperEffortLimit)
+    model.gravity.linear = np.array([1.0, 2.0, -9.0])
+    return model
+
+
+PER_JOINT = ("armature", "damping", "friction", "rotorInertia", "rotorGearRatio", "upperEffortLimit", "velocityLimit")
+
+
+@pytest.mark.parametrize(
+    ("name", "joints", "at"),
+    [
+        ("panda", ARM, {}),
+        ("panda", ["panda_joint3", "panda_joint5"], {"panda_joint4": "upper"}),
+        ("kinova", [KINOVA + "2", KINOVA + "4"], {KINOVA + "3": "lower", KINOVA + "5": "lower"}),
+        ("acrobot", ["q2"], {}),
+    ],
+)
+def test_locked_joints_stay_at_0_or_at_the_nearest_limit(name, joints, at):
+    whole = numbered(load_robot(name))
+    model, names = load_robot(whole, joints=joints), list(whole.names)[1:]
+    assert list(model.names)[1:] == joints
+    moving, rng = [names.index(joint) for joint in joints], np.random.default_rng(0)
+    q, v, a = np.zeros((3, 5, whole.nv))
+    for joint, limit in at.items():
+        q[:, names.index(joint)] = getattr(whole, f"{limit}PositionLimit")[names.index(joint)]
+    for rows in (q, v, a):
+        rows[:, moving] = rng.uniform(-2.0, 2.0, (5, len(joints)))
+    expected = RigidBody(whole).forces(q, v, a)[:, moving]
+    found = RigidBody(model).forces(q[:, moving], v[:, moving], a[:, moving])
+    assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+    for kept in (*PER_JOINT, "lowerEffortLimit", "lowerPositionLimit", "upperPositionLimit"):
+        assert_array_equal(getattr(model, kept), getattr(whole, kept)[moving], err_msg=kept)
+
+
+def test_robot_with_locked_joints_serves_simulation_and_features():
+    arm = load_robot("panda", joints=ARM)
+    assert make_dynamics(arm, 1, n_steps=5, random_state=0).data.shape == (5, 21)
+    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 40, 7))
+    torques = RigidBody(arm).forces(q, v, a)
+    X = np.hstack([q, v, a])
+    model = pickle.loads(pickle.dumps(InverseDynamics(arm, n_inducing=0).fit(X, torques)))
+    assert model.score(X, torques) > 0.9999
+    for frame in ("panda_link7", "panda_finger_joint1"):  # of a joint that moves, and of one that is locked
+        assert arm.frames[arm.getFrameId(frame)].parentJoint == 7
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (
+            ["panda_joint_1"],
+            r"no joints \['panda_joint_1'\]. Did you mean 'panda_joint1' or .* Its joints are \['panda_",
+        ),
+        (ARM[::-1], r"once, in the order of the robot \['panda_joint1', .*; got \['panda_joint7'"),
+        ([ARM[0], ARM[0]], r"each joint once, in the order of the robot \['panda_joint1'\]; got"),
+        ([], r"must be a list of names, at least one; got \[\]"),
+        ("panda_joint1", "must be a list of names, at least one; got 'panda_joint1'"),
+    ],
+)
+def test_invalid_joints_raise(joints, message):
+    with pytest.raises(ValueError, match=message):
+        load_robot("panda", joints=joints)
+
+
+def test_joints_without_a_motor_raise():
+    """Their limits, all 0, would mean that no limit is known."""
+    with pytest.raises(ValueError, match=r"None of joints=\['q1'\] has a motor.* are \['q2'\]"):
+        load_robot("acrobot", joints=["q1"])
+
+
+@pytest.mark.parametrize(("n_columns", "is_told"), [(21, True), (22, False), (30, False)])
+def test_error_about_columns_says_how_to_lock_joints(n_columns, is_told):
+    with pytest.raises(ValueError, match=rf"X has {n_columns} columns, but .* needs 27") as error:
+        RigidBodyRegressor("panda").fit(np.zeros((3, n_columns)))
+    assert ("give the robot as load_robot(robot, joints=[...]), which locks the others" in str(error.value)) == is_told
 
 
 # --- layouts -------------------------------------------------------------------------------------------------------

@@ -49,8 +49,12 @@ def test_mass_matrix_that_is_not_positive_definite_is_refused_by_all_that_loads_
 def test_model_in_memory_is_checked_too(tmp_path):
     model = load_robot(arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.01)))
     model.inertias[2].inertia = -np.eye(3)
-    with pytest.raises(ValueError, match=r"The model 'r' has a mass matrix.*that of the joint 'j2' has 1 kg"):
+    with pytest.raises(ValueError, match=r"The model 'r' has a mass matrix.*'b' of the joint 'j2' has 1 kg"):
         load_robot(model)
+    unnamed = load_robot("acrobot").copy()
+    unnamed.inertias[2].inertia = -np.eye(3)
+    with pytest.raises(ValueError, match="that of the joint 'q2' has 1 kg"):
+        load_robot(unnamed)
     model.armature = np.full(2, 2.0)  # of rotors: M = J + 2 1, with J above -2
     with pytest.warns(RobotModelWarning, match="No mass matrix has a negative eigenvalue in 300 configurations"):
         load_robot(model)

@@ -113,7 +113,8 @@ def kinds_of(robot: Any, names: Sequence[str], named: bool) -> list[Kind]:
     if len(names) != len(known):
         raise ValueError(
             f"robot has the joints {list(known)}, and the log {list(names)}: give joints of the robot by joints=, or "
-            "as many."
+            "as many. If only some joints were recorded, give the robot as load_robot(robot, joints=[...]), which "
+            "locks the others."
         )
     return ["turns" if turns else "bounded" for turns in known.values()]
 

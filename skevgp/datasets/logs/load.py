@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack, overload
@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import Bunch
 
+from ...exceptions import RobotModelWarning, warn_user
 from ...robots.loading import Robot, read_once
 from ...utils.validation import as_floats, check_real
 from .agreement import check_agreement
 from .bags import SUFFIXES as BAGS
 from .bags import read_bag
-from .jumps import Jumps, Wish, check_wrap, find_jumps, kinds_of, wishes
+from .delay import RecordedRobot, check_delay, estimate_delay
+from .jumps import Wish, check_wrap, find_jumps, kinds_of, wishes
 from .recording import Recording, Signals, completed, naming
 from .signals import Processing, in_order, pieces, process, runs
 from .tables import SECONDS, check_columns, read_table
@@ -26,6 +28,9 @@ from .tables import SUFFIXES as TABLES
 
 PathLike = str | os.PathLike[str]
 Columns = Mapping[str, int | str | Sequence[int | str]]
+_SINGULAR = 1e10  # condition number of a coupling, above which torques would be rounding
+_LATE = 0.002  # s: delays that are told
+
 Keep = slice | tuple[float | None, float | None]
 # True, False, "auto" or a period: for all joints, for each one, or by their names.
 Wrap = bool | float | str | Sequence[bool | float | str] | Mapping[str, bool | float | str]
@@ -40,6 +45,8 @@ class _Options(TypedDict, total=False):
     topic: str | None
     joints: Sequence[str] | None
     gains: ArrayLike
+    coupling: ArrayLike | None
+    delay: float | ArrayLike | Literal["auto"]
     velocity: Literal["recorded", "derive"]
     acceleration: Literal["recorded", "derive"]
     wrap: Wrap
@@ -69,6 +76,8 @@ def load_log(
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     gains: ArrayLike = 1.0,
+    coupling: ArrayLike | None = None,
+    delay: float | ArrayLike | Literal["auto"] = 0.0,
     velocity: Literal["recorded", "derive"] = "recorded",
     acceleration: Literal["recorded", "derive"] = "recorded",
     wrap: Wrap = "auto",
@@ -91,10 +100,12 @@ def load_log(
     2. Efforts are multiplied by ``gains``.
     3. Angles that wrap are unwrapped. The recording is cut into pieces at steps above ``max_gap`` and at other jumps of
        a position.
-    4. Recorded velocities and accelerations are compared with the positions. A contradiction is an error.
-    5. Signals are interpolated to a regular grid and filtered forth and back, without a shift in time.
-    6. Velocities and accelerations that were not recorded are central differences.
-    7. The ends of each piece, and rest, are cut.
+    4. Signals of motors become signals of joints by ``coupling``.
+    5. Recorded velocities and accelerations are compared with the positions. A contradiction is an error.
+    6. Efforts are moved earlier by ``delay``.
+    7. Signals are interpolated to a regular grid and filtered forth and back, without a shift in time.
+    8. Velocities and accelerations that were not recorded are central differences.
+    9. The ends of each piece, and rest, are cut.
 
     :doc:`Read a log </howto/logs>` describes each step.
 
@@ -118,6 +129,15 @@ def load_log(
         of the messages. For a table: names for its joints, by default q1, q2, ...
     gains : float or array-like of shape (n_joints,), default=1.0
         Torque per effort: 1 where efforts are in N m, else N m per A.
+    coupling : array-like of shape (n_joints, n_joints), default=None
+        Matrix A with q_joint = A q_motor, where the file has the signals of motors: ratios of gears, belts and
+        differentials. It must be invertible. Velocities and accelerations are multiplied by A too, and torques by the
+        inverse of its transpose, which keeps the power. ``gains`` and ``wrap`` are those of the motors, and angles of
+        motors are unwrapped as if there were no limits. If None, the file has the signals of joints.
+    delay : float, array-like of shape (n_joints,) or "auto", default=0.0
+        Time by which efforts lag behind positions in the recording, s. The effort recorded at t belongs to the motion
+        at t - ``delay``. It is negative if positions lag behind efforts. ``"auto"`` estimates one delay for each file,
+        between -0.1 s and 0.1 s, and needs ``robot``. With ``coupling``, an array has the delays of the joints.
     velocity : {"recorded", "derive"}, default="recorded"
         Whether to use recorded velocities, where there are any, or differences of the positions. ``"derive"`` ignores
         recorded velocities, even if they are incomplete or NaN.
@@ -128,8 +148,9 @@ def load_log(
         are clearly turns of 2π or 360, ``True`` also less clear ones, and ``False`` takes positions as they are,
         without cuts at their jumps. A sequence has a value for each joint, and a dict has values by the joints' names.
     robot : str, path-like, System or pinocchio.Model, default=None
-        Robot, as in `load_robot`. ``"auto"`` then never unwraps a joint with limits or a prismatic joint. Joints are
-        matched by ``joints`` or the names in a rosbag2 recording, or else by their order.
+        Robot, as in `load_robot`. ``wrap="auto"`` then never unwraps a joint with limits or a prismatic joint, and
+        ``delay="auto"`` is possible. Joints are matched by ``joints`` or the names in a rosbag2 recording, or else by
+        their order.
     keep : slice, tuple or sequence of them, default=None
         Rows to read: ``slice(first, stop)`` counts rows or messages from 0, and ``(first, last)`` are seconds since the
         first row, either of which may be None. A header does not count as a row, a row of units does. For several
@@ -162,13 +183,14 @@ def load_log(
         - ``recordings`` : list of Bunch, one per file, with
 
           - ``raw`` and ``processed``: each a Bunch of ``time``, ``position``, ``velocity``, ``acceleration`` and
-            ``torque``. Raw signals are None where they were not recorded or ignored, and raw positions are unwrapped.
-            ``processed`` also has ``why`` of shape (n,): ``"edge"`` or ``"rest"`` for rows that were cut, and empty for
-            the rows in ``data``;
+            ``torque``. Raw signals are None where they were not recorded or ignored. Raw positions are unwrapped, raw
+            signals are those of the joints, and raw torques are at the times of their record. ``processed`` also has
+            ``why`` of shape (n,): ``"edge"`` or ``"rest"`` for rows that were cut, and empty for the rows in ``data``;
           - ``cuts``: list of (first second, last second, ``"gap"``, ``"jump"``, ``"edge"``, ``"rest"`` or
             ``"too short"``);
           - ``wrapped``: dict of the number of jumps of each joint that were unwrapped; ``periods``: dict of their
-            periods, without joints that never wrap;
+            periods, without joints that never wrap; with ``coupling``, they are those of the motors;
+          - ``delay``: ndarray of shape (n_joints,) of the delays of the efforts, s;
           - ``start``: the first row's time by the file's own clock, s;
           - ``n_repeated``: number of rows with the time of another row; ``n_incomplete``: number of incomplete rows at
             the beginning and the end; and ``filename``;
@@ -188,7 +210,13 @@ def load_log(
     OSError
         If a table is not there or must not be read.
     ImportError
-        If a rosbag2 file is given and rosbags is not installed; the message gives the pip command.
+        If a rosbag2 file is given and rosbags is not installed, or a robot or ``delay="auto"`` needs Pinocchio and it
+        is not installed; the message gives the pip command.
+
+    Warns
+    -----
+    RobotModelWarning
+        If ``delay="auto"`` finds a delay above 0.002 s. It is corrected.
 
     See Also
     --------
@@ -200,6 +228,10 @@ def load_log(
     Neighbouring rows of filtered signals are nearly the same. Cross-validate by ``groups``, never by rows.
 
     Units of positions are not converted. Degrees stay degrees, and are unwrapped by 360.
+
+    ``delay="auto"`` shifts the efforts by each delay, and regresses them on the dynamics of the robot with friction.
+    The regression finds masses and friction, so that only lengths and axes of the robot must be right. Positions must
+    be in rad or m. The delay is 0 if none is clearly better.
 
     Examples
     --------
@@ -232,6 +264,11 @@ def load_log(
             raise ValueError(f'{name} must be "recorded" or "derive"; got {source!r}.')
     ignored = [name for name, source in sources.items() if source == "derive"]
     check_wrap(wrap)
+    if isinstance(delay, str):
+        if delay != "auto":
+            raise ValueError(f'delay must be "auto", a number, or one for each joint, s; got {delay!r}.')
+        if robot is None:
+            raise ValueError('delay="auto" needs robot=...: its dynamics tell which delay fits the motion.')
     if not isinstance(decimal, str) or decimal not in (".", ","):
         raise ValueError(f"decimal must be '.' or ','; got {decimal!r}.")
     if joints is not None and (
@@ -256,9 +293,16 @@ def load_log(
                 read = _table(file, asked, time_unit, topic, names, decimal)
             names = read.joint_names
             wanted = wishes(wrap, names)
-            kinds = kinds_of(given, names, named=joints is not None or asked is None)
-            recordings.append(_recording(read, file, limit, gains, how, wanted, kinds))
+            named = joints is not None or asked is None
+            kinds = kinds_of(given, names, named)
+            if coupling is not None:
+                kinds = kinds_of(None, names, named)  # motors have no limits
+            motors = _Motors.of(gains, coupling, len(names))
+            late = RecordedRobot.of(given, names, named) if isinstance(delay, str) else check_delay(delay, len(names))
+            recordings.append(_recording(read, file, limit, motors, how, wanted, kinds, late))
     assert names is not None
+    if isinstance(delay, str):
+        _warn_of_delays(recordings)
     log = _log(recordings, names, how)
     return (log.data, log.target) if return_X_y else log
 
@@ -334,22 +378,23 @@ def _recording(
     read: Recording,
     file: Path,
     keep: Keep | None,
-    gains: ArrayLike,
+    motors: _Motors,
     how: Processing,
     wrap: Sequence[Wish],
     kinds: Sequence[str],
+    delay: np.ndarray | RecordedRobot,
 ) -> Bunch:
-    """Check and process the signals of a file."""
+    """Check and process the signals of a file; the delay is estimated if it is a robot."""
     kept, n_incomplete = completed(read, _kept(read.signals.time, keep))
-    factor, n_joints = as_floats(gains, "gains"), len(read.joint_names)
-    if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
-        raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
-    raw, step, gap = in_order(replace(kept, torque=kept.torque * factor), how.max_gap, read.joint_names)
+    raw, step, gap = in_order(replace(kept, torque=kept.torque * motors.gains), how.max_gap, read.joint_names)
     with np.errstate(all="ignore"):
         found = find_jumps(raw.time, raw.position, step, gap, wrap, kinds)
-        raw = replace(raw, position=found.position)
-        _check_derivatives(raw, list(pieces(raw.time, gap, found.cuts)), read.joint_names, found, how)
-        done = process(raw, step, gap, how, found.cuts)
+        raw = motors.joints(replace(raw, position=found.position))
+        parts, wrapped = list(pieces(raw.time, gap, found.cuts)), motors.steps_of_joints(found.wrapped)
+        _check_derivatives(raw, parts, read.joint_names, wrapped, how)
+        if isinstance(delay, RecordedRobot):
+            delay = np.full(len(read.joint_names), estimate_delay(raw, step, gap, how, found.cuts, delay))
+        done = process(raw, step, gap, how, found.cuts, delay if delay.any() else None)
     for name, signal in vars(done.signals).items():
         if not np.isfinite(signal).all():
             raise ValueError(f"its {name} overflows when it is filtered and differentiated.")
@@ -363,15 +408,72 @@ def _recording(
         cuts=done.cuts,
         wrapped=dict(zip(read.joint_names, found.wraps, strict=True)),
         periods={n: period for n, period in zip(read.joint_names, found.periods, strict=True) if period is not None},
+        delay=delay,
     )
 
 
-def _check_derivatives(raw: Signals, parts: list[slice], names: list[str], found: Jumps, how: Processing) -> None:
+@dataclass(frozen=True)
+class _Motors:
+    """How signals of motors become those of joints."""
+
+    gains: np.ndarray  # () or (n_joints,), torque per effort
+    coupling: np.ndarray | None  # (n_joints, n_joints), position of each joint per position of each motor
+
+    @classmethod
+    def of(cls, gains: ArrayLike, coupling: ArrayLike | None, n_joints: int) -> _Motors:
+        """Check the arguments of `load_log`."""
+        factor = as_floats(gains, "gains")
+        if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
+            raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
+        if coupling is None:
+            return cls(factor, None)
+        matrix = as_floats(coupling, "coupling")
+        if matrix.shape != (n_joints, n_joints) or not np.isfinite(matrix).all():
+            raise ValueError(
+                f"coupling must be a finite matrix of shape ({n_joints}, {n_joints}), with a row for each joint and a "
+                f"column for each motor; got {coupling!r}."
+            )
+        condition = float(np.linalg.cond(matrix))
+        if not condition < _SINGULAR:
+            raise ValueError(
+                f"coupling must be invertible, so that motors determine joints and torques; its condition number is "
+                f"{condition:.3g}."
+            )
+        return cls(factor, matrix)
+
+    def joints(self, signals: Signals) -> Signals:
+        """Return the signals of the joints."""
+        if self.coupling is None:
+            return signals
+        matrix = self.coupling
+        moved = signals.each(lambda signal: signal @ matrix.T)
+        # The power of all joints is that of all motors: τ_joint = A⁻ᵀ τ_motor.
+        return replace(moved, torque=np.linalg.solve(matrix.T, signals.torque.T).T)
+
+    def steps_of_joints(self, wrapped: np.ndarray) -> np.ndarray:
+        """Return the steps (n, n_joints) of joints at which an angle of a motor that moves them wrapped."""
+        if self.coupling is None:
+            return wrapped
+        return (wrapped.astype(float) @ (self.coupling.T != 0.0)) > 0.0
+
+
+def _warn_of_delays(recordings: list[Bunch]) -> None:
+    """Warn if efforts were moved."""
+    late = {one.filename: one.delay[0] for one in recordings if abs(one.delay[0]) > _LATE}
+    if late:
+        told = ", ".join(f"{1e3 * delay:.1f} ms in {filename}" for filename, delay in late.items())
+        warn_user(
+            f"Efforts lag behind positions by {told}. This was corrected. Pass delay=0.0 to keep the times.",
+            RobotModelWarning,
+        )
+
+
+def _check_derivatives(
+    raw: Signals, parts: list[slice], names: list[str], wrapped: np.ndarray, how: Processing
+) -> None:
     """Raise if recorded velocities contradict positions, or accelerations contradict velocities."""
     if raw.velocity is not None:
-        check_agreement(
-            raw.time, raw.position, raw.velocity, parts, names, slowest=how.rest_velocity, wrapped=found.wrapped
-        )
+        check_agreement(raw.time, raw.position, raw.velocity, parts, names, slowest=how.rest_velocity, wrapped=wrapped)
     if raw.acceleration is not None:
         velocity = raw.velocity
         if velocity is None:
@@ -440,8 +542,11 @@ def _story(recording: Bunch, length: int) -> str:
     incomplete = f"{recording.n_incomplete} incomplete at the ends; " if recording.n_incomplete else ""
     jumps = sum(why == "jump" for *_, why in cuts)
     cut_at = f"; positions jump {jumps} times" if jumps else ""
+    low, high = 1e3 * recording.delay.min(), 1e3 * recording.delay.max()
+    moved = "" if low == high == 0.0 else f"; efforts moved earlier by {low:.3g} ms"
+    moved += f" to {high:.3g} ms" if low != high else ""
     return (
         f"{recording.filename}: {length} rows of {len(raw.time)} recorded in {raw.time[-1] - raw.time[0]:.4g} s "
         f"({recording.n_repeated} more repeated a time; {incomplete}cut: {', '.join(lost) or 'nothing'}{cut_at}"
-        f"{unwrapped})"
+        f"{unwrapped}{moved})"
     )

@@ -113,13 +113,24 @@ def runs(flags: np.ndarray) -> Iterator[slice]:
         yield slice(start, stop)
 
 
-def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Sequence[tuple[int, int]] = ()) -> Processed:
-    """Filter and differentiate each piece of a sorted recording; raise if no row remains."""
+def process(
+    raw: Signals,
+    step: float,
+    gap: float,
+    how: Processing,
+    jumps: Sequence[tuple[int, int]] = (),
+    delay: np.ndarray | None = None,
+) -> Processed:
+    """Filter and differentiate each piece of a sorted recording; raise if no row remains.
+
+    `delay` (n_joints,) is how much later than the motion the efforts are, s. None stands for 0.
+    """
     how.check_frequencies(step)
     parts, reasons = [], []
     cuts: list[Cut] = []
-    grid = _Grid.of(raw, step, how)
+    grid = Grid.of(raw, step, how)
     dt = grid.h * grid.inside
+    late, early = (0.0, 0.0) if delay is None else (max(delay.max(), 0.0), max(-delay.min(), 0.0))
     before = -1
     reached = {after for _, after in jumps}
     for rows in pieces(raw.time, gap, jumps):
@@ -128,7 +139,7 @@ def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Seque
             why_not = "jump" if rows.start in reached else "gap"
             cuts.append((float(raw.time[before]), float(piece.time[0]), why_not))
         before = rows.stop - 1
-        done = _process_piece(piece, grid, how)
+        done = process_piece(piece, grid, how, delay)
         if done is None:
             cuts.append((float(piece.time[0]), float(piece.time[-1]), "too short"))
             continue
@@ -137,15 +148,15 @@ def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Seque
         reasons.append(why)
         cuts.extend(
             (
-                max(float(signals.time[run][0]) - dt / 2.0, float(piece.time[0])),
-                min(float(signals.time[run][-1]) + dt / 2.0, float(piece.time[-1])),
+                max(float(signals.time[run][0]) - dt / 2.0 - early * (run.start == 0), float(piece.time[0])),
+                min(float(signals.time[run][-1]) + dt / 2.0 + late * (run.stop == len(why)), float(piece.time[-1])),
                 reason,
             )
             for reason in ("edge", "rest")
             for run in runs(why == reason)
         )
     if not parts:
-        lost = 2.0 * grid.edge * dt
+        lost = 2.0 * grid.edge * dt + late + early
         jumping = (
             f" Positions jump {len(jumps)} times, first at {raw.time[jumps[0][0]]:g} s, and each jump cuts it. "
             "Positions that move in steps are taken as they are with wrap=False."
@@ -161,7 +172,7 @@ def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Seque
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """The grid on which signals are filtered and differentiated."""
 
     h: float  # its step, s
@@ -170,7 +181,7 @@ class _Grid:
     edge: int  # rows that are cut at each end of a piece
 
     @classmethod
-    def of(cls, raw: Signals, step: float, how: Processing) -> _Grid:
+    def of(cls, raw: Signals, step: float, how: Processing) -> Grid:
         """Choose a grid that is no coarser than the recording: it is thinned out after the filter, against aliasing."""
         dt = step if how.dt is None else how.dt
         inside = max(1, int(np.ceil(dt / step - 1e-6)))
@@ -181,9 +192,13 @@ class _Grid:
         return cls(dt / inside, inside, cutoff, edge)
 
 
-def _process_piece(piece: Signals, grid: _Grid, how: Processing) -> tuple[Signals, np.ndarray] | None:
+def process_piece(
+    piece: Signals, grid: Grid, how: Processing, delay: np.ndarray | None = None
+) -> tuple[Signals, np.ndarray] | None:
     """Return the signals on the grid, and why rows are cut; None if the piece is too short."""
     fine = _regular(piece, grid.h) if how.dt is None else _on_grid(piece, grid.h)
+    if delay is not None and len(piece.time) > 1:
+        fine = _with_efforts_earlier(fine, piece, delay)
     n_rows = (len(fine.time) - 1) // grid.inside + 1
     if n_rows <= 2 * grid.edge:
         return None
@@ -220,6 +235,17 @@ def _on_grid(piece: Signals, h: float) -> Signals:
     time = first + h * np.arange(int((last - first) / h + 1e-6) + 1)
     inside = np.minimum(time, last)
     return piece.each(lambda signal: PchipInterpolator(piece.time, signal, axis=0)(inside), time)
+
+
+def _with_efforts_earlier(fine: Signals, piece: Signals, delay: np.ndarray) -> Signals:
+    """Interpolate the efforts at the delayed times of the rows, and drop the rows for which there are none."""
+    delayed = fine.time[:, np.newaxis] + delay
+    there = ((delayed >= piece.time[0]) & (delayed <= piece.time[-1])).all(axis=1)
+    torques = [
+        PchipInterpolator(piece.time, recorded)(times)
+        for recorded, times in zip(piece.torque.T, delayed[there].T, strict=True)
+    ]
+    return replace(fine.at(there), torque=np.column_stack(torques))
 
 
 def _filtered(signals: Signals, cutoff: float, h: float) -> Signals:

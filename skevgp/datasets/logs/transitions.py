@@ -20,7 +20,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
     the target. Nothing is resampled or filtered. Angles are unwrapped as by `load_log`. Transitions across a gap,
-    across a jump of a position or through rest, and rows with the time of another row, are left out.
+    across a jump of a position or through rest, and rows with the time of another row, are left out. With a ``delay``
+    of `load_log`, torques are the means of the efforts that were recorded later than the transition by the delay.
 
     Parameters
     ----------
@@ -121,9 +122,14 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
         )
     steps = np.diff(raw.time)
     whole = np.ones(len(steps), dtype=bool)
+    # Efforts that act in a step were recorded later by their delay.
+    late = np.append(recording.delay, 0.0)
     for first, last, why in recording.cuts:
         if why in ("gap", "rest", "jump"):
             whole &= (raw.time[1:] <= first) | (raw.time[:-1] >= last)
+        if why == "gap":
+            whole &= (raw.time[1:] + late.max() <= first) | (raw.time[:-1] + late.min() >= last)
+    whole &= (raw.time[:-1] + late.min() >= raw.time[0]) & (raw.time[1:] + late.max() <= raw.time[-1])
     starts = np.concatenate(
         [np.arange(run.start, run.stop - stride + 1, stride) for run in runs(whole)] or [np.empty(0, dtype=np.intp)]
     )
@@ -131,5 +137,11 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
     states = np.hstack([raw.position, raw.velocity])
     dt = (raw.time[ends] - raw.time[starts])[:, np.newaxis]
     impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
-    torque = raw.torque[starts] if stride == 1 else (impulse[ends] - impulse[starts]) / dt
+    if recording.delay.any():
+        impulse = np.column_stack(
+            [np.interp(raw.time + delay, raw.time, own) for delay, own in zip(recording.delay, impulse.T, strict=True)]
+        )
+        torque = (impulse[ends] - impulse[starts]) / dt
+    else:
+        torque = raw.torque[starts] if stride == 1 else (impulse[ends] - impulse[starts]) / dt
     return np.hstack([states[starts], torque, dt, states[ends], raw.time[starts, np.newaxis]])

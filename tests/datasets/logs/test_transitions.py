@@ -60,6 +60,19 @@ def test_there_is_no_transition_across_a_gap(load, stride):
     assert len(found.data) == (399 // stride) + (len(t) - 401) // stride
 
 
+@pytest.mark.parametrize("stride", [1, 3])
+def test_torques_are_the_efforts_recorded_later_by_the_delay(load, stride):
+    t = np.delete(np.arange(0.0, 8.0, 0.01), slice(400, 450))
+    table, late = table_of(t), np.array([3, -2])
+    log = load(table, delay=0.01 * late)
+    found = log_transitions(log, stride=stride)
+    assert len(found.data) in range(len(t) // stride - 16, len(t) // stride)
+    for row, start in zip(found.data, np.searchsorted(t, found.time - 1e-6), strict=True):
+        way = start + np.arange(stride)
+        for joint, rows in enumerate(late):
+            assert_allclose(row[4 + joint], GAIN * table[way + rows, 6 + joint].mean(), rtol=1e-8)
+
+
 def test_velocities_must_be_recorded(load):
     log = load(table_of(T), columns={"time": 0, "position": [1, 2], "effort": [6, 7]})
     with pytest.raises(ValueError, match="0.csv: there are no recorded velocities"):

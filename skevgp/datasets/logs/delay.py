@@ -1,0 +1,169 @@
+"""Find how much later than the motion the efforts of a recording are.
+
+Torques of a rigid body with friction are linear in its parameters. The efforts are shifted by each delay in turn, and
+regressed on the torques per parameter. The delay with the smallest residuals is that of the recording. This does not
+depend on the masses in the robot's model. Without a robot, the dynamics that a simpler regression lacks look like a
+delay of up to 0.1 s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from ...robots import RigidBody
+from ...robots.loading import Robot, known_robot
+from ...utils.validation import as_floats
+from .recording import Signals
+from .signals import Grid, Processing, pieces, process_piece
+
+_LARGEST = 0.1  # s: delays that are tried
+_COARSE, _FINE = 41, 21  # number of delays that are tried in all of the range, and around the best one
+_CUTOFF = 5.0  # Hz, if the log is not filtered
+_ROWS = 10.0  # per period of the cutoff: enough for splines between them
+_MOST = 3000  # rows of a regression, evenly spread
+_STICTION = 0.05  # rad/s or m/s, within which Coulomb friction changes its sign
+_DEPENDENT = 1e-8  # of the largest singular value: below it, parameters have no effect of their own
+_CLEAR = 10.0  # nats that a delay gains over none; below it, there is none
+_LEAST_SHARE = 1e-15  # of the variance of efforts: rounding
+
+
+def check_delay(delay: Any, n_joints: int) -> np.ndarray:
+    """Return the delay of each joint (n_joints,), s."""
+    values = as_floats(delay, "delay")
+    if values.shape not in ((), (n_joints,)) or not np.isfinite(values).all():
+        raise ValueError(f"delay must be a finite number, or one for each of the {n_joints} joints; got {delay!r}.")
+    return np.broadcast_to(values, n_joints).copy()
+
+
+@dataclass(frozen=True)
+class RecordedRobot:
+    """A robot whose moving joints are those of a log."""
+
+    body: RigidBody
+    columns: list[int]  # the log's number of each joint
+
+    @classmethod
+    def of(cls, robot: Robot, names: Sequence[str], named: bool) -> RecordedRobot:
+        """Lock the joints that the log lacks; joints are matched by order if the names are not `named`."""
+        model = known_robot(robot)
+        known = list(model.names)[1:]
+        if not named or not set(names) <= set(known):
+            return cls(RigidBody(model), list(range(len(names))))
+        joints = [name for name in known if name in names]
+        return cls(RigidBody(known_robot(model, joints=joints)), [names.index(name) for name in joints])
+
+    def torques_per_parameter(self, signals: Signals) -> list[np.ndarray]:
+        """Return the regressor (n, n_parameters) of each column of the log: of all links, and friction of the joint."""
+        assert signals.velocity is not None
+        assert signals.acceleration is not None
+        states = signals.position, signals.velocity, signals.acceleration
+        links = self.body.torque_regressor(*(state[:, self.columns] for state in states))
+        of_log = links[:, np.argsort(self.columns)]
+        one = np.ones(len(links))
+        return [
+            np.column_stack([of_log[:, joint], acceleration, velocity, np.tanh(velocity / _STICTION), one])
+            for joint, (velocity, acceleration) in enumerate(
+                zip(signals.velocity.T, signals.acceleration.T, strict=True)
+            )
+        ]
+
+
+def estimate_delay(
+    raw: Signals, step: float, gap: float, how: Processing, jumps: Sequence[tuple[int, int]], robot: RecordedRobot
+) -> float:
+    """Return the delay of the efforts of a sorted recording, one for all joints, s; 0 if none is clear."""
+    how.check_frequencies(step)
+    cutoff = min(_CUTOFF, 0.2 / step) if how.cutoff is None else how.cutoff
+    how = replace(how, cutoff=cutoff, dt=max(step, 1.0 / (_ROWS * cutoff)))
+    fit = _Regressions.of(raw, step, gap, how, jumps, robot)
+    if fit is None:
+        return 0.0
+    tried = np.linspace(-_LARGEST, _LARGEST, _COARSE)
+    best = int(np.argmin(fit.deviances(tried)))
+    near = tried[best] + (tried[1] - tried[0]) * np.linspace(-1.0, 1.0, _FINE)
+    deviances = fit.deviances(np.append(near, 0.0))
+    lowest = 1 + int(np.argmin(deviances[1:-2]))  # with a neighbour on both sides
+    if deviances[-1] - deviances[lowest] < _CLEAR:
+        return 0.0
+    if best in (0, _COARSE - 1):
+        raise ValueError(
+            f'delay="auto" tries delays up to {_LARGEST:g} s, and the efforts fit the robot best at {near[lowest]:.3g} '
+            "s. Look at the signals, and pass the delay as a number."
+        )
+    before, at, after = deviances[lowest - 1 : lowest + 2]
+    # The minimum of the parabola through the three.
+    return float(near[lowest] + 0.5 * (near[1] - near[0]) * (before - after) / (before - 2.0 * at + after))
+
+
+@dataclass(frozen=True)
+class _Regressions:
+    """Regressions of the efforts of all joints, for any delay."""
+
+    times: list[np.ndarray]  # of the rows of each piece, s
+    efforts: list[CubicSpline]  # of each piece
+    bases: list[np.ndarray]  # (n, rank) for each joint: orthonormal, of the space of the regressor's columns
+    n_independent: float  # rows that are as informative as these, which are filtered
+
+    @classmethod
+    def of(
+        cls,
+        raw: Signals,
+        step: float,
+        gap: float,
+        how: Processing,
+        jumps: Sequence[tuple[int, int]],
+        robot: RecordedRobot,
+    ) -> _Regressions | None:
+        """Filter a recording; return None if no row is left."""
+        grid, found = Grid.of(raw, step, how), []
+        for rows in pieces(raw.time, gap, jumps):
+            done = process_piece(raw.at(rows), grid, how)
+            if done is not None:
+                signals, why = done
+                first, last = signals.time[[0, -1]]
+                # Rows whose efforts are there for each delay, with one step to spare.
+                reach = 1.1 * _LARGEST
+                whole = (why == "") & (signals.time >= first + reach) & (signals.time <= last - reach)
+                found.append((signals, np.flatnonzero(whole)))
+        n_rows = sum(len(rows) for _, rows in found)
+        if not n_rows:
+            return None
+        every = int(np.ceil(n_rows / _MOST))
+        kept = [(signals, rows[::every]) for signals, rows in found]
+        at = [signals.at(rows) for signals, rows in kept]
+        regressors = [
+            np.concatenate(parts) for parts in zip(*(robot.torques_per_parameter(s) for s in at), strict=True)
+        ]
+        assert how.dt is not None
+        assert how.cutoff is not None
+        return cls(
+            [signals.time for signals in at],
+            [CubicSpline(signals.time, signals.torque) for signals, _ in kept],
+            [_basis(regressor) for regressor in regressors],
+            min(n_rows, 2.0 * how.cutoff * how.dt * n_rows),
+        )
+
+    def deviances(self, delays: np.ndarray) -> np.ndarray:
+        """Return the negative log likelihood of each delay, up to a constant, with the noise of each joint profiled."""
+        found = []
+        for delay in delays:
+            efforts = np.concatenate([spline(t + delay) for spline, t in zip(self.efforts, self.times, strict=True)])
+            efforts -= efforts.mean(axis=0)
+            total = (efforts**2).sum(axis=0)
+            explained = [((basis.T @ own) ** 2).sum() for basis, own in zip(self.bases, efforts.T, strict=True)]
+            moves = total > 0.0
+            share = 1.0 - np.array(explained)[moves] / total[moves]
+            found.append(0.5 * self.n_independent * np.log(np.maximum(share, _LEAST_SHARE)).sum())
+        return np.array(found)
+
+
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of the space of the columns."""
+    sizes = np.linalg.norm(columns, axis=0)
+    left, values, _ = np.linalg.svd(columns[:, sizes > 0.0] / sizes[sizes > 0.0], full_matrices=False)
+    return left[:, values > _DEPENDENT * values[0]]
