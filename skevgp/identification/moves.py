@@ -12,8 +12,8 @@ from .weights import Rows
 
 # Names of the effects of a move on a joint's torque, the columns of `terms`.
 EFFECTS = ("offset", "viscous", "coulomb", "gain")
-# Steps of expectation maximisation.
-_STEPS = 50
+# Steps of expectation maximisation, in each of some rounds for the correlation of errors.
+_STEPS, _ROUNDS = 30, 4
 # Least share of the noise of left-out moves that is not the variation between moves.
 _OWN = 0.05
 # Blocks of a move differ less than moves do. With so few moves, variances are multiplied by 1 + 1 / (2 moves).
@@ -45,18 +45,21 @@ def variation(
 ) -> tuple[MoveEffects, JointNoise]:
     """Find how moves differ, and the noise that is left, from what other moves predict wrongly, missed (n,)."""
     # Each move has its own effects d ~ N(0, diag(t)), as in a linear model with random effects. Expectation
-    # maximisation finds the most likely t. Rows count less if their errors are correlated in time, so that slow errors
-    # within a move are not taken for effects.
+    # maximisation finds the most likely t. Rows count less if errors are correlated in time, so that slow errors within
+    # a move are not taken for effects. At first all of the errors count as such, then what effects leave.
     std = np.sqrt(noise.of(speed))
-    scale = std * np.sqrt(correlation_time(missed / std, rows.runs))
-    scaled, errors = z / scale[:, np.newaxis], missed / scale
-    parts = [(scaled[rows.groups == move], errors[rows.groups == move]) for move in np.unique(rows.groups)]
-    informations = [(own.T @ own, own.T @ left) for own, left in parts]
     size = np.mean(z**2, axis=0)
     variance = np.where(size > 0.0, np.mean(missed**2) / np.where(size > 0.0, size, 1.0), 0.0)
-    for _ in range(_STEPS):
-        found = [_posterior(variance, *information) for information in informations]
-        variance = np.mean([d**2 + np.diag(covariance) for d, covariance in found], axis=0)
+    moves = [rows.groups == move for move in np.unique(rows.groups)]
+    within = missed.copy()
+    for _ in range(_ROUNDS):
+        scale = std * np.sqrt(np.mean((within / std) ** 2) * correlation_time(within / std, rows.runs))
+        informations = [_information(z[own], missed[own], scale[own]) for own in moves]
+        for _ in range(_STEPS):
+            found = [_posterior(variance, *information) for information in informations]
+            variance = np.mean([d**2 + np.diag(covariance) for d, covariance in found], axis=0)
+        for own, (d, _) in zip(moves, found, strict=True):
+            within[own] = missed[own] - z[own] @ d
     between = float(np.mean(z**2 @ variance / std**2)) * noise.variance
     n_moves = rows.n_moves
     factor = 1.0 + 0.5 / n_moves if n_moves <= _FEW else 1.0
@@ -69,9 +72,11 @@ def of_move(
 ) -> MoveEffects:
     """Return the effects of a move after some of its rows, whose errors without effects are missed (n,)."""
     std = np.sqrt(noise.of(speed))
-    scale = std * np.sqrt(correlation_time(missed / std, runs))
-    rows = z / scale[:, np.newaxis]
-    return MoveEffects(*_posterior(np.diag(before.covariance), rows.T @ rows, rows.T @ (missed / scale)))
+    mean, covariance = before
+    for _ in range(_ROUNDS):
+        scale = std * np.sqrt(correlation_time((missed - z @ mean) / std, runs))
+        mean, covariance = _posterior(np.diag(before.covariance), *_information(z, missed, scale))
+    return MoveEffects(mean, covariance)
 
 
 def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -82,6 +87,12 @@ def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.nd
     unit = np.where(size > 0.0, size, 1.0)
     inverse = np.linalg.pinv((rows / unit).T @ (rows / unit), rcond=1e-8, hermitian=True) / np.outer(unit, unit)
     return inverse @ (rows.T @ (missed / scale)), inverse
+
+
+def _information(z: np.ndarray, missed: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ZᵀZ and Zᵀe of rows in units of their scale (n,)."""
+    rows = z / scale[:, np.newaxis]
+    return rows.T @ rows, rows.T @ (missed / scale)
 
 
 def _posterior(variance: np.ndarray, information: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
