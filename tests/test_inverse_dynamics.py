@@ -1,3 +1,4 @@
+import copy
 import warnings
 
 import numpy as np
@@ -5,7 +6,7 @@ import pandas as pd
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose
-from sklearn.exceptions import ConvergenceWarning
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.preprocessing import StandardScaler
 
 from skevgp import InverseDynamics
@@ -239,3 +240,161 @@ def test_invalid_payloads_raise(arm, rigid):
             rigid.estimate_payload(arm.X, arm.y, **{name: 0.0})
     free = InverseDynamics(n_inducing=0).fit(arm.X, arm.y)
     assert not hasattr(free, "estimate_payload")
+
+
+# --- moves that differ -----------------------------------------------------------------------------------------------
+
+
+def test_torque_that_differs_from_move_to_move_makes_nothing_worse_than_physics():
+    """A Gaussian process fits it in each training move."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 20.0, 0.05)
+    X = np.concatenate([0.5 * trajectory(1, seed, dt=0.05) for seed in range(6)])
+    moves = np.repeat(np.arange(6), 200)
+    own = rng.uniform(0.0, 2.0 * np.pi, (6, 2))[moves]
+
+    def torque(X):
+        return X[:, 2] / 4.0 + 9.81 / 2.0 * np.sin(X[:, 0]) + 0.3 * np.tanh(X[:, 1] / 0.01)
+
+    y = torque(X) + 0.5 * np.sin(2.0 * X[:, 0] + own[:, 0]) + 0.3 * np.sin(X[:, 1] + own[:, 1])
+    y += 0.05 * rng.normal(size=len(y))
+    model, physics = (
+        InverseDynamics("pendulum", n_inducing=n_inducing, random_state=0).fit(X, y, groups=moves)
+        for n_inducing in (20, 0)
+    )
+    wave = np.column_stack([2.0 * np.sin(3.0 * t), 6.0 * np.cos(3.0 * t), -18.0 * np.sin(3.0 * t)])
+    for new in (wave, 0.5 * trajectory(1, 99, dt=0.05)):
+        error, least = (np.sqrt(np.mean((one.predict(new) - torque(new)) ** 2)) for one in (model, physics))
+        assert error <= 1.02 * least
+
+
+class Changing:
+    """An acrobot whose offset, friction and gain differ from move to move."""
+
+    def __init__(self, offset=1.0, n_moves=16):
+        self.rng, self.robot = np.random.default_rng(0), load_robot("acrobot")
+        self.scale = np.array([[offset], [0.03], [0.1], [0.01]])
+        moves = [self.move(seed) for seed in range(n_moves)]
+        self.X, self.y = (np.concatenate(part) for part in zip(*moves, strict=True))
+        self.groups = np.repeat(np.arange(n_moves), len(self.X) // n_moves)
+
+    def move(self, seed, load=0.0):
+        """Return X and y of a move, in which gravity is larger in the first joint."""
+        X, rng = trajectory(2, seed), self.rng
+        offset, viscous, coulomb, gain = self.scale * rng.normal(size=(4, 2))
+        q, v, a = np.split(X, 3, axis=1)
+        rigid = RigidBody(self.robot).forces(q, v, a)
+        rigid[:, 0] += load * RigidBody(self.robot).forces(q, 0.0 * v, 0.0 * a)[:, 0]
+        y = (1.0 + gain) * rigid + (0.1 + viscous) * v + (0.3 + coulomb) * np.tanh(v / 0.01) + offset
+        return X, y + 0.1 * rng.normal(size=y.shape)
+
+    def fit(self):
+        return InverseDynamics("acrobot", n_inducing=0).fit(self.X, self.y, groups=self.groups)
+
+
+@pytest.fixture(scope="module")
+def changing():
+    return Changing()
+
+
+def chi2(model, X, y):
+    mean, std = model.predict(X, return_std=True)
+    return np.mean(((y - mean) / std) ** 2)
+
+
+def test_update_lowers_the_error_of_the_rest_of_a_move(changing):
+    model, ratios = changing.fit(), []
+    assert model.move_scale_.shape == model.move_.shape == (2, 4)
+    assert_allclose(model.move_, 0.0)
+    assert_allclose(model.move_scale_[:, 0], changing.scale[0], rtol=0.6)
+    for seed in range(100, 110):
+        X, y = changing.move(seed)
+        fresh = copy.deepcopy(model)
+        before, wide = fresh.predict(X[150:], return_std=True)
+        after, narrow = fresh.update(X[:150], y[:150]).predict(X[150:], return_std=True)
+        ratios.append(np.mean((after - y[150:]) ** 2, axis=0) / np.mean((before - y[150:]) ** 2, axis=0))
+        assert (narrow.mean(axis=0) < wide.mean(axis=0)).all()
+        assert chi2(fresh, X[150:], y[150:]) < 2.0
+    assert np.exp(0.5 * np.mean(np.log(ratios))) < 0.5
+
+
+def test_update_begins_anew_and_fit_resets_it(changing):
+    model = changing.fit()
+    first, second = changing.move(200), changing.move(201)
+    alone = copy.deepcopy(model).update(*second)
+    twice = model.update(*first)
+    assert np.abs(twice.move_ - alone.move_).max() > 1e-3
+    twice.update(*second)
+    for found, expected in zip(
+        twice.predict(changing.X, return_std=True), alone.predict(changing.X, return_std=True), strict=True
+    ):
+        assert_allclose(found, expected, rtol=1e-6)
+    # If no row follows another, rows have more information.
+    apart = copy.deepcopy(model).update(*second, pieces=np.arange(len(second[1])))
+    assert (apart.predict(changing.X, return_std=True)[1] <= (1.0 + 1e-6) * alone.predict(changing.X, return_std=True)[1]).all()
+    assert_allclose(twice.fit(changing.X, changing.y, groups=changing.groups).move_, 0.0)
+
+
+@pytest.mark.parametrize("method", ["update", "check_log"])
+def test_log_of_a_wrong_shape_raises(rigid, arm, method):
+    call = getattr(rigid, method)
+    for wrong in ((arm.X[:, :12], arm.y), (arm.X, arm.y[:, :4]), (arm.X[:-1], arm.y), (np.nan * arm.X, arm.y)):
+        with pytest.raises(ValueError, match="X|y|samples"):
+            call(*wrong)
+    with pytest.raises(ValueError, match="pieces"):
+        call(arm.X, arm.y, pieces=[0, 1])
+    with pytest.raises(NotFittedError):
+        getattr(InverseDynamics("ur5"), method)(arm.X, arm.y)
+
+
+def test_ordinary_logs_fail_the_check_as_often_as_stated_and_loads_are_found(changing):
+    # Logs of 10 s and a rate of 0.6 a minute: a probability of 0.1.
+    model, options = changing.fit(), {"dt": 0.02, "false_alarms_per_minute": 0.6}
+    checks = [model.check_log(*changing.move(seed), **options) for seed in range(300, 340)]
+    assert np.mean([not check.fits for check in checks]) <= 0.3
+    for check in checks:
+        assert check.fits == (check.p_value >= 0.1) == (not check.joints)
+        assert check.p_value == pytest.approx(min(1.0, 2.0 * check.p_values.min()))
+    for seed in range(400, 405):
+        loaded = model.check_log(*changing.move(seed, load=0.1), **options)
+        assert not loaded.fits
+        assert loaded.joints == ["q1"]
+    # What is an alarm depends on the stated rate, and `update` does not count.
+    log = changing.move(500)
+    p_value = model.check_log(*log, **options).p_value
+    assert model.update(*changing.move(501)).check_log(*log, **options).p_value == pytest.approx(p_value)
+    assert not model.check_log(*log, dt=0.02, false_alarms_per_minute=6.0 * 1.01 * p_value).fits
+    assert model.check_log(*log, dt=0.02, false_alarms_per_minute=6.0 * 0.99 * p_value).fits
+
+
+@pytest.mark.parametrize("name", ["dt", "false_alarms_per_minute"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_invalid_rates_of_checks_raise(rigid, arm, name, value):
+    with pytest.raises(ValueError, match=name):
+        rigid.check_log(arm.X, arm.y, **{name: value})
+
+
+# --- what a log cannot tell ------------------------------------------------------------------------------------------
+
+
+def warnings_of(X, y, **data):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        InverseDynamics("acrobot", n_inducing=0).fit(X, y, **data)
+    assert all(one.category is ConvergenceWarning for one in caught)
+    return [str(one.message) for one in caught]
+
+
+def test_weaknesses_of_a_log_are_named():
+    arm = Arm("acrobot", error=0.05)
+    assert warnings_of(arm.X, arm.y, groups=arm.groups) == []
+    still = arm.X.copy()
+    still[:, [1, 3, 5]] = [0.3, 0.0, 0.0]
+    said = warnings_of(still, arm.torque(still) + 0.02 * np.random.default_rng(0).normal(size=arm.y.shape))
+    assert any(one.startswith("['q2'] never move") for one in said)
+    said = warnings_of(arm.X, arm.y * [0.01, 1.0], groups=arm.groups)
+    assert any(one.startswith("Torques of ['q1'] are at most") for one in said)
+    # A filter as long as a fifth of the log: few independent rows.
+    few = Arm("acrobot", error=0.05, n_groups=1)
+    slow = np.apply_along_axis(np.convolve, 0, np.random.default_rng(0).normal(size=(549, 2)), np.ones(50), "valid")
+    said = warnings_of(few.X, few.torque(few.X) + 0.1 * slow)
+    assert any("Record more motion." in one for one in said)

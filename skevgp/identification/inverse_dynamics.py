@@ -51,14 +51,16 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     .. math::
 
-        \tau_j = (1 + c_j) \, Y_j(q, \dot q, \ddot q)\,\pi + F_j(\dot q, \ddot q)\,\varphi + f_j(x_j) + \varepsilon_j
+        \tau_j = (1 + c_j) \, Y_j(q, \dot q, \ddot q)\,\pi + F_j(\dot q, \ddot q)\,\varphi + a_j f_j(x_j)
+        + z_j^\top d_j + \varepsilon_j
 
     The weights β = (π, φ) of `RigidBodyRegressor` are common to all joints, and have the robot's model as prior mean.
     The c are errors of the motors' gains, if these are not known. Each f_j is a sparse Gaussian process
     (`EVGPRegressor`) of the residual torque of joint j. Its inputs are those of the joint, :math:`x_j = (q_j, \dot q_j,
     \ddot q_j, \hat\tau_j)`, with the torque :math:`\hat\tau_j` by the weights, because friction of gears depends on
-    load and speed. The noise is larger at low speeds, where the sign of Coulomb friction is not known. See
-    :doc:`/guide/torques`.
+    load and speed. Moves that were left out decide how much it counts, by the share a_j from 0 to 1. The d_j are offset,
+    friction and gain of a move, which differ from day to day. The noise is larger at low speeds, where the sign of
+    Coulomb friction is not known. See :doc:`/guide/torques`.
 
     Parameters
     ----------
@@ -107,9 +109,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     standing_std_ : ndarray of shape (n_outputs,)
         Additional standard deviation by friction at rest.
     residual_std_ : ndarray of shape (n_outputs,)
-        Prior standard deviation of each f_j, or 0 if there is none.
+        Prior standard deviation of each a_j f_j, or 0 if there is none.
     residual_models_ : list of EVGPRegressor or None
-        The models f_j.
+        The models f_j. None where left-out moves do not confirm one.
+    residual_share_ : ndarray of shape (n_outputs,)
+        The a_j.
     correlation_time_ : ndarray of shape (n_outputs,)
         Number of rows that contain as much information on the weights as an independent row.
     inflation_ : float
@@ -141,10 +145,12 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     -----
     Weights are fitted first by Bayesian regression, together with noise, static friction and gains. Filtered rows count
     less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a training row is
-    predicted from other groups or blocks of rows, so that y is not used twice. Signal and noise of f_j are calibrated
-    by left-out groups. Each f_j is at most as large as the residuals, and its length scales, except that of the speed,
-    are at least the standard deviation of their column. Memory is a few times 8 bytes times n_samples * n_outputs *
-    n_h.
+    predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as large as the
+    residuals, and its length scales are at most three standard deviations of their column and, except that of the
+    speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn. Weights
+    and f_j are then fitted anew. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that errors
+    fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j fades.
+    Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
 
     References
     ----------
@@ -231,8 +237,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             Torques in N m (N), or with ``gain_scale`` currents times gains of a catalogue. Up to 1e40, and the largest
             of a column must be 0 or above 1e-105.
         groups : array-like of shape (n_samples,), default=None
-            Labels of the trajectory of each row. Credible intervals for new trajectories need at least three of them,
-            each with less than half of the rows. Otherwise blocks of rows are used.
+            Labels of the move (trajectory) of each row. Credible intervals for new moves need at least three of them,
+            each with less than four fifths of the rows. Otherwise blocks of rows are used.
         pieces : array-like of shape (n_samples,), default=None
             Labels of rows that follow each other without a gap, such as ``load_log(...).pieces``. If None, the rows of
             a group have no gaps.
@@ -369,6 +375,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.noise_variance_ = np.array([one.variance for one in noise])
         self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])
         self.residual_std_ = np.array([joint.signal for joint in self._joints])
+        self.residual_share_ = np.array([joint.share for joint in self._joints])
         self.residual_models_ = [joint.model for joint in self._joints]
         self.move_scale_ = np.sqrt([np.diag(joint.effects.covariance) for joint in self._joints])
         self.move_ = np.zeros_like(self.move_scale_)
