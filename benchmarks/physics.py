@@ -4,6 +4,7 @@
     python benchmarks/physics.py errors --systems pendulum cartpole
     python benchmarks/physics.py wrong                        # half an hour of one core
     python benchmarks/physics.py rollouts                     # ten minutes of one core
+    python benchmarks/physics.py curves                       # half an hour of one core
     python benchmarks/physics.py errors --quick
 
 All models of a cell learn from the same rows, with `EVGPRegressor`'s defaults: 100 inducing points for each. VGP is the
@@ -13,6 +14,8 @@ of the error of the noise-free target. Coverage and the NLPD are those of noisy 
 
 *errors*: the systems of the paper from 4 trajectories and from the paper's number, and robots that the features'
 default prior was not made for (a double pendulum, a UR5 and a Panda) from 4 and 40.
+
+*curves*: the same errors of the smaller systems from 2 to 16 trajectories.
 
 *wrong*: features that are wrong, against the same model without features. "another robot" has the features of the
 acrobot for the cartpole, and the reverse. "gravity upwards" has a guess of gravity with the wrong sign. "noise" adds
@@ -27,6 +30,7 @@ from __future__ import annotations
 import itertools
 from collections import namedtuple
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,6 +48,7 @@ SYSTEMS = ("pendulum", "cartpole", "cartpole_damped", "acrobot", "iiwa14")
 UNSEEN = ("double_pendulum", "ur5", "panda")
 MODELS = ("VGP", "RES-VGP", "EVGP-IF", "EVGP-IFG")
 NOISES = (0.01, 0.0)
+CURVE = (2, 4, 8, 16)
 FEW, MANY = 4, {**dict.fromkeys(SYSTEMS, 0), **dict.fromkeys(UNSEEN, 40)}  # 0: the paper's number
 TEST_TRAJECTORIES, STEPS = 40, 100
 WRONG = ("another robot", "gravity upwards", "noise")
@@ -205,7 +210,40 @@ def tables_of_rollouts(rows: pd.DataFrame) -> harness.Tables:
     return {"rollouts": wide[list(MODELS)].reset_index()}
 
 
+def tables_of_curves(rows: pd.DataFrame) -> harness.Tables:
+    keys = ["system", "noise", "trajectories"]
+    wide = rows.pivot_table(index=keys, columns="model", values="error", sort=False)[list(MODELS)]
+    return {"curves": wide.apply(harness.best, axis=1).reset_index()}
+
+
+def plot_curves(rows: pd.DataFrame, path: Path) -> None:
+    """Draw Error over the number of trajectories: a panel for each system, lines with noise, dots without."""
+    systems = harness.ordered(SYSTEMS, rows["system"])
+    figure, panels = harness.pyplot().subplots(
+        2, 2, figsize=(harness.WIDTH, 5.6), sharex=True, squeeze=False, layout="constrained"
+    )
+    for axes, system in zip(panels.flat, systems, strict=False):
+        for color, model in zip(harness.PALETTE, MODELS, strict=False):
+            for noise, style in zip(NOISES, ("-o", ":o"), strict=True):
+                own = rows[(rows["system"] == system) & (rows["model"] == model) & (rows["noise"] == noise)]
+                mean = own.groupby("trajectories")["error"].mean()
+                label = f"{model}, noise {100 * noise:g} %"
+                axes.plot(mean.index, mean, style, color=color, markersize=3, label=label)
+        harness.logarithmic(axes)
+        axes.set_xscale("log", base=2)
+        axes.set(title=system, xticks=CURVE, xticklabels=CURVE)
+    for axes in panels[-1]:
+        axes.set_xlabel("trajectories")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("Error, SI units")
+    harness.legend(figure, ncols=4)
+    harness.save_picture(figure, path)
+
+
 def cells_of(part: str, options: Any) -> list[Any]:
+    if part == "curves":
+        systems, sizes = (SYSTEMS[:1], CURVE[:2]) if options.quick else (options.systems or SYSTEMS[:-1], CURVE)
+        return [Errors(*cell) for cell in itertools.product(systems, NOISES, sizes, options.seeds)]
     systems = options.systems or ({"errors": (*SYSTEMS, *UNSEEN)}.get(part) or ("pendulum", "cartpole", "acrobot"))
     if options.quick:
         systems = systems[:1]
@@ -221,11 +259,17 @@ def cells_of(part: str, options: Any) -> list[Any]:
     return [Wrong(name, *cell) for name in WRONG for cell in cells if name != "another robot" or cell[0] in OTHER]
 
 
-JOBS = {"errors": run_errors, "wrong": run_wrong, "rollouts": run_rollouts}
-TABLES = {"errors": tables_of_errors, "wrong": tables_of_wrong, "rollouts": tables_of_rollouts}
-FILES = {"errors": "physics", "wrong": "physics_wrong", "rollouts": "physics_rollouts"}
+JOBS = {"errors": run_errors, "curves": run_errors, "wrong": run_wrong, "rollouts": run_rollouts}
+TABLES = {
+    "errors": tables_of_errors,
+    "curves": tables_of_curves,
+    "wrong": tables_of_wrong,
+    "rollouts": tables_of_rollouts,
+}
+FILES = {"errors": "physics", "curves": "physics_curves", "wrong": "physics_wrong", "rollouts": "physics_rollouts"}
 TITLES = {
     "errors": "What physics in the model gains",
+    "curves": "What physics gains as data grow",
     "wrong": "Features that are wrong",
     "rollouts": "Many steps ahead with as many inducing points",
 }
@@ -239,6 +283,8 @@ def main() -> None:
     output = harness.output_path(options, FILES[options.part])
     job = partial(JOBS[options.part], quick=options.quick)
     n_failures = harness.run_missing(cells_of(options.part, options), job, output, options.jobs)
+    if options.part == "curves":
+        plot_curves(harness.frame(output), output.with_suffix(".png"))
     harness.write_page(TITLES[options.part], TABLES[options.part](harness.frame(output)), output, n_failures)
 
 

@@ -92,13 +92,15 @@ def test_columns_are_called_as_the_kernel_sees_them():
 
 
 def test_torques_say_what_all_joints_share_and_what_is_of_each():
-    y = 1.2 * X[:, 1] + np.sign(X[:, 0]) + 0.1 * RNG.randn(40)
-    m = InverseDynamics(n_inducing=3, max_iter=2, random_state=0).fit(np.column_stack([X, X[:, 0] ** 2]), y)
+    rows = np.random.RandomState(0).uniform(-2.0, 2.0, (200, 2))
+    y = 1.2 * rows[:, 1] + np.abs(rows[:, 0]) + np.sin(rows[:, 1])
+    m = InverseDynamics(n_inducing=8, max_iter=2, random_state=0).fit(np.column_stack([rows, rows.sum(axis=1)]), y)
     summary = m.summary()
     weights = numbers(summary.to_frame(), "weight")
     np.testing.assert_array_equal(weights.value, m.coef_)
     assert weights.index.tolist() == m.coef_names_.tolist()
     assert numbers(summary.to_frame(), "noise std").value.tolist() == [m.noise_variance_[0] ** 0.5]
+    assert m.residual_std_ > 0.0  # left-out rows say that the Gaussian process is worth its place
     assert numbers(summary.to_frame(), "signal std").value.tolist() == pytest.approx(m.residual_std_)
     assert summary.certificate == ""
     assert "What was learned" in m._repr_html_()
