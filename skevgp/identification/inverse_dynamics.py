@@ -58,9 +58,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     The c are errors of the motors' gains, if these are not known. Each f_j is a sparse Gaussian process
     (`EVGPRegressor`) of the residual torque of joint j. Its inputs are those of the joint, :math:`x_j = (q_j, \dot q_j,
     \ddot q_j, \hat\tau_j)`, with the torque :math:`\hat\tau_j` by the weights, because friction of gears depends on
-    load and speed. Moves that were left out decide how much it counts, by the share a_j from 0 to 1. The d_j are offset,
-    friction and gain of a move, which differ from day to day. The noise is larger at low speeds, where the sign of
-    Coulomb friction is not known. See :doc:`/guide/torques`.
+    load and speed. Moves that were left out decide how much it counts, by the share a_j from 0 to 1. The d_j are
+    offset, friction and gain of a move, which differ from day to day. The noise is larger at low speeds, where the sign
+    of Coulomb friction is not known. See :doc:`/guide/torques`.
 
     Parameters
     ----------
