@@ -93,7 +93,7 @@ SIMULATED = {
 
 @lru_cache
 def simulated(robot: str, move: str) -> Bunch:
-    """Return a move of a simulated arm whose friction depends on the load, and changes from day to day."""
+    """Return a move of a simulated arm whose friction depends on the load, and differs from move to move by 10 %."""
     kinds = {"faster": 4, "one joint at a time": 5, "another day": 6}
     number = kinds.get(move) or int(move.split()[1])
     rng, features = np.random.default_rng(number), RigidBodyRegressor(robot)
@@ -104,12 +104,13 @@ def simulated(robot: str, move: str) -> Bunch:
     if move == "one joint at a time":
         X = X.reshape(len(X), 3, n) * (np.arange(len(X)) * n // len(X) == np.arange(n)[:, np.newaxis]).T[:, np.newaxis]
         X = X.reshape(len(X), 3 * n)
-    model = perturb_robot(robot, 0.2, random_state=1)
-    body = RigidBodyRegressor(model).fit(X)
-    torque = body.transform(X)[:, :, : 10 * n] @ body.coef_prior(n)[0][: 10 * n]
-    largest = np.abs(torque).max(axis=0) + 1.0
+    body = RigidBodyRegressor(perturb_robot(robot, 0.2, random_state=1)).fit(X)
+    links = body.coef_prior(n)[0][: 10 * n]
+    usual = robots.trajectory(np.random.default_rng(0), n, "full")
+    torque, largest = body.transform(X)[:, :, : 10 * n] @ links, body.transform(usual)[:, :, : 10 * n] @ links
+    largest = np.abs(largest).max(axis=0) + 1.0
     speed = np.tanh(X[:, n : 2 * n] / 0.02)
-    day = 1.0 + 0.05 * rng.normal(size=n) + (0.2 if move == "another day" else 0.0)
+    day = 1.0 + 0.1 * rng.normal(size=n) + (0.15 if move == "another day" else 0.0)
     friction = day * speed * (0.05 * largest + 0.1 * np.abs(torque)) + 0.05 * largest * X[:, n : 2 * n]
     noise = 0.01 * largest * rng.normal(size=torque.shape)
     return Bunch(data=X, target=torque + friction + noise + 0.01 * largest * rng.normal(size=n))
@@ -220,9 +221,8 @@ def run_inverse(cell: Inverse, data: Path | None) -> list[dict[str, Any]]:
     train = rows_of(cell.robot, trained, data, cell.size)
     model, has_std, by_groups = inverse_model(cell.model, robot, cell.size == "quick")
     groups = {"groups": train.groups} if by_groups else {}
-    y = train.target if train.target.shape[1] > 1 or cell.model in INVERSE[:3] else train.target.ravel()
-    if cell.model == "gradient boosting":
-        y = train.target
+    of_one = train.target.shape[1] == 1 and cell.model not in (*INVERSE[:3], "gradient boosting")
+    y = train.target.ravel() if of_one else train.target
     seconds, _ = harness.timed(lambda: model.fit(train.data, y, **groups))
     base, found = LinearTorques(robot).fit(train.data, train.target), []
     for move in tested:

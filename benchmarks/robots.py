@@ -208,8 +208,9 @@ class LinearThenGP(RegressorMixin, BaseEstimator):
         return self
 
     def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
-        mean, std = self.regressor.predict(X, return_std=True)
-        mean = mean + self.linear.predict(X)
+        linear = self.linear.predict(X)
+        mean, std = (values.reshape(linear.shape) for values in self.regressor.predict(X, return_std=True))
+        mean = mean + linear
         return (mean, std) if return_std else mean
 
 
