@@ -304,12 +304,6 @@ def fitted(changing):
     return changing.fit()
 
 
-EFFECTS_COUNT_AS_SLOW = pytest.mark.xfail(
-    strict=True, reason="the correlation time is that of errors which include the effects of moves"
-)
-
-
-@EFFECTS_COUNT_AS_SLOW
 def test_update_lowers_the_error_of_the_rest_of_a_move(changing, fitted):
     squares = []
     assert fitted.move_scale_.shape == fitted.move_.shape == (2, 4)
@@ -323,6 +317,26 @@ def test_update_lowers_the_error_of_the_rest_of_a_move(changing, fitted):
         assert np.mean(((after - y[150:]) / narrow) ** 2) < 2.0
     first, rest = np.sqrt(np.mean(squares, axis=0))
     assert (rest < 0.5 * first).all()
+
+
+@pytest.mark.parametrize("method", ["update", "check_log"])
+def test_fewer_than_three_moves_do_not_say_how_moves_differ(changing, method):
+    few = changing.groups < 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model = InverseDynamics("acrobot", n_inducing=0).fit(
+            changing.X[few], changing.y[few], groups=changing.groups[few]
+        )
+    with pytest.raises(ValueError, match="at least 3 groups"):
+        getattr(model, method)(changing.X[:50], changing.y[:50])
+
+
+def test_a_fit_without_a_group_has_rows_where_few_are_taken():
+    """Every third row is of the same group."""
+    X = trajectory(1, 0)[:598]
+    y = X[:, 2] / 4.0 + 9.81 / 2.0 * np.sin(X[:, 0]) + 0.1 * np.random.default_rng(0).normal(size=len(X))
+    model = InverseDynamics("pendulum", max_rows=200).fit(X, y, groups=np.arange(len(X)) % 3)
+    assert np.isfinite(model.predict(X)).all()
 
 
 def test_update_begins_anew_and_fit_resets_it(changing, fitted):
@@ -378,7 +392,6 @@ def test_ordinary_logs_fail_the_check_as_often_as_stated_and_loads_are_found():
     assert_allclose(check(log, 0.6).p_values, before, rtol=1e-6)
 
 
-@EFFECTS_COUNT_AS_SLOW
 def test_shift_that_hardly_changes_the_size_of_errors_does_not_fit():
     machine = Changing(0.005)
     model = machine.fit()

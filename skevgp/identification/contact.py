@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_toeplitz
-from sklearn.utils.validation import NotFittedError, check_is_fitted
+from sklearn.utils.validation import check_is_fitted
 
-from ..utils.validation import check_real, checked_groups
+from ..utils.state import StatefulEstimator
+from ..utils.validation import check_real, checked_groups, unchanged_if_it_fails
 from .inverse_dynamics import InverseDynamics
 
 # Durations of the pushes that the filters match, s. Filters see this many of the longest one.
@@ -22,8 +24,8 @@ _TAIL, _FEWEST = 0.25, 8
 _WHITE = 1e-3
 
 
-class ContactMonitor:
-    r"""Detect contact by the errors of a robot's torques, with a stated rate of false alarms.
+class ContactMonitor(StatefulEstimator):
+    r"""Detect contact by the errors of a robot's torques, with a limited rate of false alarms.
 
     Errors of a model of torques are correlated in time: friction and inertia are wrong for as long as a motion lasts.
     For each joint and for pushes of 0.05 s, 0.15 s and 0.4 s, the matched filter of these errors,
@@ -32,23 +34,23 @@ class ContactMonitor:
 
         g = \frac{s^\top C^{-1} z}{\sqrt{s^\top C^{-1} s}}
 
-    sees a constant push s best, in errors z (in predicted standard deviations) with the covariance C of free motion.
+    detects a constant push s best, in errors z (in predicted standard deviations) with the covariance C of free motion.
     There is an alarm when the largest :math:`|g|` is above a threshold. The threshold follows from the tail of its
     maxima in free motion.
 
     Parameters
     ----------
     model : InverseDynamics
-        Fitted model of the robot.
+        Fitted model of the robot. `fit` copies it.
     dt : float, default=0.01
         Time between rows, s, which is constant.
     false_alarms_per_hour : float, default=1.0
-        Expected number of false alarms in an hour of free motion. Alarms within a second are one.
+        Largest expected number of false alarms in an hour of free motion. Alarms within a second are one.
 
     Attributes
     ----------
     threshold_ : float
-        Largest statistic without an alarm.
+        Rows with a larger statistic raise an alarm.
     scale_ : ndarray of shape (n_joints, 3)
         Root mean square of each g in free motion.
     detectable_ : ndarray of shape (n_joints,)
@@ -56,6 +58,8 @@ class ContactMonitor:
         always found.
     hours_ : float
         Free motion that `fit` has seen, h.
+    model_ : InverseDynamics
+        Copy of the model. Fit the monitor again after `InverseDynamics.update` or another fit of the model.
 
     See Also
     --------
@@ -116,11 +120,20 @@ class ContactMonitor:
         Raises
         ------
         ValueError, TypeError
-            If an argument is out of its range, or no piece is as long as 16 seconds together with others.
+            If an argument is out of its range, the model is no `InverseDynamics`, or the rows without the first 0.8 s
+            of each piece are fewer than 16 s.
         """
+        if not isinstance(self.model, InverseDynamics):
+            raise TypeError(f"model must be a fitted InverseDynamics; got {type(self.model).__name__}.")
         check_is_fitted(self.model)
+        with unchanged_if_it_fails(self):
+            self._fit(X, y, pieces)
+        return self
+
+    def _fit(self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None) -> None:
         step = check_real(self.dt, "dt", minimum=0.0, strict=True)
         rate = check_real(self.false_alarms_per_hour, "false_alarms_per_hour", minimum=0.0, strict=True)
+        self.model_ = deepcopy(self.model)
         z, std, runs = self._errors(X, y, pieces)
         parts = [z[runs == run] for run in np.unique(runs)]
         self._lengths = [max(1, round(push / step)) for push in _PUSHES]
@@ -145,7 +158,6 @@ class ContactMonitor:
         gain = np.abs(self._filters[:, -1, -self._lengths[-1] :].sum(axis=1)) / self.scale_[:, -1]
         self.detectable_ = self.threshold_ * np.sqrt(np.mean(std**2, axis=0)) / gain
         self.reset()
-        return self
 
     def score_samples(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> np.ndarray:
         """Return the statistic of rows.
@@ -161,7 +173,7 @@ class ContactMonitor:
             Largest absolute g over joints and pushes, in root mean squares of free motion. The first 0.8 s of each
             piece have 0.
         """
-        self._check_fitted()
+        check_is_fitted(self)
         z, _, runs = self._errors(X, y, pieces)
         found = np.zeros(len(z))
         for run in np.unique(runs):
@@ -200,7 +212,7 @@ class ContactMonitor:
         alarm : bool
             The same as `predict` for all rows since `reset`.
         """
-        self._check_fitted()
+        check_is_fitted(self)
         z, _, _ = self._errors(np.atleast_2d(np.asarray(x)), np.atleast_2d(np.asarray(y)), None)
         self._last = np.concatenate([self._last, z])[-self._window :]
         if len(self._last) < self._window:
@@ -209,18 +221,15 @@ class ContactMonitor:
 
     def reset(self) -> None:
         """Forget the rows of the stream, for example after a gap."""
+        check_is_fitted(self)
         self._last = np.zeros((0, len(self._filters)))
-
-    def _check_fitted(self) -> None:
-        if not hasattr(self, "threshold_"):
-            raise NotFittedError("This ContactMonitor is not fitted yet. Call fit with free motion first.")
 
     def _errors(
         self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return errors (n, o) in predicted std, std, and labels (n,) of rows without gaps."""
-        rows, targets = self.model._new_log(X, y)
-        mean, std = self.model.predict(rows, return_std=True)
+        rows, targets = self.model_._new_log(X, y)
+        mean, std = self.model_.predict(rows, return_std=True)
         std = std.reshape(targets.shape)
         runs = checked_groups(pieces, len(rows), "pieces")
         z = (targets - mean.reshape(targets.shape)) / std
@@ -262,6 +271,8 @@ def _threshold(maxima: np.ndarray, wanted: float) -> float:
     """Return the level that this number of maxima of blocks is expected to exceed."""
     # Excesses over a high level are nearly exponential (Coles 2001, chapter 4). Those of logarithms are taken, a
     # heavier tail, and their mean plus its standard error: free motion that `fit` has not seen may be of another kind.
+    if wanted >= _TAIL * len(maxima):  # nothing is beyond what was seen
+        return float(np.quantile(maxima, max(0.0, 1.0 - wanted / len(maxima))))
     count = min(len(maxima) - 1, max(_FEWEST, round(_TAIL * len(maxima))))
     largest = np.sort(np.log(np.maximum(maxima, 1e-300)))[::-1]
     level, excess = largest[count], float(np.mean(largest[:count] - largest[count])) * (1.0 + count**-0.5)

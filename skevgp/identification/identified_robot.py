@@ -215,7 +215,7 @@ class IdentifiedRobot(TorqueRegression):
 
         All parameters of the robot and the ten parameters of the payload are identified again from both logs. The
         uncertainty of the robot therefore widens the interval of the payload. The mean of each f_j is subtracted as if
-        it were known.
+        it were known. `InverseDynamics.update` does not count.
 
         Parameters
         ----------

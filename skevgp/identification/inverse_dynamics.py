@@ -29,7 +29,7 @@ from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
 from .log_check import check_of
-from .moves import of_move, terms
+from .moves import FEWEST_MOVES, of_move, terms
 from .weaknesses import weaknesses
 from .weights import Fold, Rows, condensed, folds
 
@@ -111,7 +111,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     residual_std_ : ndarray of shape (n_outputs,)
         Prior standard deviation of each a_j f_j, or 0 if there is none.
     residual_models_ : list of EVGPRegressor or None
-        The models f_j. None where left-out moves do not confirm one.
+        The models f_j, before their means fade. None where left-out moves do not confirm one.
     residual_share_ : ndarray of shape (n_outputs,)
         The a_j.
     correlation_time_ : ndarray of shape (n_outputs,)
@@ -286,7 +286,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         with ignored(category=RobotModelWarning):  # given already
             self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)
-        self._known = condensed(rows, self._weights)
+        self._known, self._n_moves = condensed(rows, self._weights), rows.n_moves
         if self.consistent and self._has_robot:
             size = 10 * targets.shape[1]
             start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
@@ -347,7 +347,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             delayed(fit_joint_residual)(
                 self._own(X, guessed, j),
                 residual[:, j],
-                [Fold(part.out, part.torques[:, j]) for part in parts],
+                [Fold(part.out, part.torques[:, j], part.variance[:, j]) for part in parts],
                 y[:, j],
                 rows,
                 rows.speed[:, j],
@@ -430,7 +430,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
         Friction changes with temperature, and sensors drift. Each joint has an offset, viscous friction, Coulomb
         friction and gain of its own in each move, whose variances `fit` finds by left-out moves (``move_scale_``). A
-        few seconds of a new log determine them. Weights, f_j and noise stay.
+        few seconds of a new log determine them. Weights and f_j stay. A joint stays as it is if updates by the first
+        third of left-out moves did not lower the errors of the rest.
 
         Parameters
         ----------
@@ -444,12 +445,12 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Returns
         -------
         self : InverseDynamics
-            The estimator itself. Predictions are those of the move of X. Another call begins anew.
+            The estimator itself. Predictions are those of the move of X. Another call replaces this one.
 
         Raises
         ------
         ValueError, TypeError
-            If shapes do not fit or data are not finite.
+            If shapes do not fit, data are not finite, or `fit` had fewer than three ``groups``.
 
         Examples
         --------
@@ -465,12 +466,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         >>> bool(abs(after) < 0.5 * abs(before))
         True
         """
-        check_is_fitted(self)
-        rows, missed, _, z = self._errors_of(X, y, pieces)
-        self._joints = [
-            replace(joint, move=of_move(joint.effects, z[j], missed[:, j], rows.speed[:, j], joint.noise, rows.runs))
-            for j, joint in enumerate(self._joints)
-        ]
+        rows, missed, _, z = self._errors_of(X, y, pieces, "update")
+        for j, joint in enumerate(self._joints):
+            if joint.update is not None:
+                move = of_move(joint.update, z[j], missed[:, j], rows.speed[:, j], joint.noise, rows.runs)
+                self._joints[j] = replace(joint, move=move)
         self.move_ = np.array([joint.move.mean for joint in self._joints])
         return self
 
@@ -483,10 +483,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         dt: float = 0.01,
         false_alarms_per_minute: float = 0.01,
     ) -> Bunch:
-        """Test whether a log is that of the machine of `fit`, without another load, a fault or contact.
+        """Test whether a log fits the model, without another load, a fault or contact.
 
-        Errors of the log are compared with errors of left-out moves at `fit`: their mean square, and the offset,
-        friction and gain that they are explained by. `update` does not count.
+        Errors of the log are compared with errors of left-out moves at `fit`, by their mean square and by the offset,
+        friction and gain that explain them. `update` does not count.
 
         Parameters
         ----------
@@ -495,24 +495,25 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         dt : float, default=0.01
             Time between rows, s.
         false_alarms_per_minute : float, default=0.01
-            Rate of ordinary logs that are found not to fit, per minute of the log.
+            Expected false alarms per minute of log, for logs without a fault.
 
         Returns
         -------
         check : Bunch
             - ``fits`` : bool, whether the log fits;
-            - ``p_value`` : float, probability of an ordinary log that fits no better;
+            - ``p_value`` : float, probability that an ordinary log fits as badly or worse;
             - ``p_values`` : ndarray of shape (n_joints,), the same for each joint alone;
             - ``joints`` : list of str, joints that do not fit.
 
         Raises
         ------
         ValueError, TypeError
-            If shapes do not fit, data are not finite, or an argument is out of its range.
+            If shapes do not fit, data are not finite, an argument is out of its range, or `fit` had fewer than three
+            ``groups``.
 
         Notes
         -----
-        With few moves at `fit` only large differences can be told from ordinary ones.
+        With few moves at `fit`, only large faults are found.
 
         Examples
         --------
@@ -525,17 +526,21 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         >>> model.check_log(X[:300], torque[:300]).fits, model.check_log(X[:300], 1.1 * torque[:300]).joints
         (True, ['q'])
         """
-        check_is_fitted(self)
         step = check_real(dt, "dt", minimum=0.0, strict=True)
         rate = check_real(false_alarms_per_minute, "false_alarms_per_minute", minimum=0.0, strict=True)
-        rows, missed, std, z = self._errors_of(X, y, pieces)
-        probability = min(1.0, rate * len(missed) * step / 60.0)
+        rows, missed, std, z = self._errors_of(X, y, pieces, "check_log")
+        probability = min(0.5, rate * len(missed) * step / 60.0)
         return check_of(self._joints, self._outputs, missed, std, z, rows.runs, probability)
 
     def _errors_of(
-        self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None
+        self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None, method: str
     ) -> tuple[Rows, np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return the rows of a new log, errors and std (n, o) for a move that no row is known of, and z of joints."""
+        """Return the rows of a new log, errors and std (n, o) for a move without training rows, and z of joints."""
+        check_is_fitted(self)
+        if self._n_moves < FEWEST_MOVES:
+            raise ValueError(
+                f"{method} compares moves. Fit with at least {FEWEST_MOVES} groups; the number was {self._n_moves}."
+            )
         rows_x, targets = self._new_log(X, y)
         rows = self._as_rows(rows_x, targets, None, pieces)
         physics = self._weights.predict(rows.features)

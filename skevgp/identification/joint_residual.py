@@ -55,7 +55,8 @@ class JointResidual:
     model: QuietRegressor | None  # of the joint's own columns; None if physics alone predicts
     noise: JointNoise
     share: float
-    effects: MoveEffects  # of a move that no row is known of, as moves differ
+    effects: MoveEffects  # of a move without training rows
+    update: MoveEffects | None  # as in `Variation`
     move: MoveEffects  # of the move that rows are predicted of
     # (moves,): log mean squares of the errors of left-out moves, in predicted standard deviations.
     log_squares: np.ndarray
@@ -92,39 +93,42 @@ def fit_joint_residual(
     smooth: np.ndarray,
     **options: Any,
 ) -> JointResidual:
-    """Fit the Gaussian process of a joint to some of the rows x (n, d), and find by left-out moves what it is worth."""
+    """Fit the Gaussian process of a joint to some of the rows x (n, d), and find its share by left-out moves."""
     # residual (n,) is that of weights of all rows. folds have the torques by weights of other moves, beside the target
     # (n,). noise is that of the residual without f. Below velocity v_s, the lowest speed at which friction may have a
     # sign, rows count less for f. If filters blur the sign, the noise is larger up to a higher speed, but there f
     # learns the average friction. some are the indices that f is fitted to; smooth (d,) are the columns of x with long
     # length scales; options are those of EVGPRegressor.
-    physics, missed = np.empty(len(x)), np.empty(len(x))
+    physics, missed, known = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
     for fold in folds:
-        physics[fold.out] = fold.torques[fold.out]
+        physics[fold.out], known[fold.out] = fold.torques[fold.out], fold.variance
         missed[fold.out] = (target - fold.torques)[fold.out]
 
-    def ended(
-        model: QuietRegressor | None, share: float, missed: np.ndarray, found: JointNoise, own: np.ndarray | float = 0.0
-    ) -> JointResidual:
+    def ended(model: QuietRegressor | None, share: float, missed: np.ndarray, own: np.ndarray) -> JointResidual:
+        # The variance of errors is that of f, own (n,), of effects of moves, and of noise. That of weights, which few
+        # rows have, counts as noise too: errors of new moves are larger than those of left-out ones.
+        found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
+        left = found.variance - float(np.mean(own * found.variance / found.of(speed)))
+        floor = _OWN * found.variance if model is not None else noise.variance
+        found = found._replace(variance=max(left, floor))
         z = terms(speed, physics, found.velocity)
-        effects, found = variation(z, missed, speed, found, rows)
-        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own)
+        effects, update, found = variation(z, missed, speed, found, own, rows)
+        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own + known)
         logs = [np.log(np.mean(squares[rows.groups == move])) for move in np.unique(rows.groups)]
-        return JointResidual(model, found, share, effects, effects, np.array(logs))
+        return JointResidual(model, found, share, effects, update, effects, np.array(logs))
 
-    size = float(np.mean(residual**2))
-    found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, noise.variance)
+    size, least = float(np.mean(residual**2)), _LEAST * noise.variance
     if size <= _NOTHING:
         nothing = MoveEffects.none()
-        return JointResidual(None, found, 0.0, nothing, nothing, np.zeros(1))
+        found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, noise.variance)
+        return JointResidual(None, found, 0.0, nothing, None, nothing, np.zeros(0))
     if not options["n_inducing"]:
-        return ended(None, 0.0, missed, found)
+        return ended(None, 0.0, missed, np.zeros(len(x)))
     spread = x[some].std(axis=0)
     spread = np.where(spread > 1e-9 * np.abs(x[some]).max(axis=0), spread, 1.0)
     shortest = np.where(smooth, _SHORTEST, _SHORTEST_OF_SPEED)
     signal = ConstantKernel(0.25 * size, (_SMALLEST_SIGNAL**2 * size, _LARGEST_SIGNAL**2 * size))
     kernel = signal * RBF(_START * spread, np.column_stack([shortest * spread, _LONGEST * spread]))
-    least = _LEAST * noise.variance
     sharp = noise_at(residual, speed, noise.coulomb, velocity, least)
     relative = sharp.of(speed) / sharp.variance
     model = QuietRegressor(kernel=kernel, noise_cv=None, **options)
@@ -133,31 +137,26 @@ def fit_joint_residual(
     iterations = model.max_iter if model.max_iter is not None else _ITERATIONS_OF_TRIAL
     trial = clone(model).set_params(max_iter=min(iterations, _ITERATIONS_OF_TRIAL))
     for fold in folds:
-        kept = some[~fold.out[some]] if not fold.out.all() else some
+        kept = np.flatnonzero(~fold.out if not fold.out.all() else fold.out)
         kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _ROWS_OF_TRIAL)).astype(int))]
         trial.fit(x[kept], (target - fold.torques)[kept], relative_variance=relative[kept])
         mean[fold.out], variance[fold.out] = trial.faded(x[fold.out])
-    share = _share(missed, mean, relative, folds)
+    share = _share(missed, mean, relative, rows.groups)
     if share == 0.0:
-        return ended(None, 0.0, missed, found)
+        return ended(None, 0.0, missed, np.zeros(len(x)))
     model.fit(x[some], residual[some], relative_variance=relative[some])
-    missed = missed - share * mean
-    found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
-    own = share**2 * variance
-    left = found.variance - float(np.mean(own / relative))
-    return ended(model, share, missed, found._replace(variance=max(left, _OWN * found.variance)), own)
+    return ended(model, share, missed - share * mean, share**2 * variance)
 
 
-def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, folds: list[Fold]) -> float:
+def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, moves: np.ndarray) -> float:
     """Return the share of f that fits left-out moves best, or 0 if it may be useless."""
     # Each move counts the same, however large its torques are: the mean over moves of the logarithm of the mean square.
     # f is kept if a t-test says that the logarithm falls.
-    squares = np.array(
-        [[np.mean((missed - a * mean)[fold.out] ** 2 / relative[fold.out]) for fold in folds] for a in _SHARES]
-    )
+    groups = [moves == move for move in np.unique(moves)]
+    squares = np.array([[np.mean((missed - a * mean)[own] ** 2 / relative[own]) for own in groups] for a in _SHARES])
     falls = np.log(np.maximum(squares, 1e-300)) - np.log(np.maximum(squares[0], 1e-300))
     best = int(np.argmin(falls.mean(axis=1)))
-    fall, count = falls[best], len(folds)
+    fall, count = falls[best], len(groups)
     if best == 0 or count < 2:
         return 0.0
     error = fall.std(ddof=1) / np.sqrt(count)

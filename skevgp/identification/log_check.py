@@ -1,4 +1,4 @@
-"""Does a log fit a model? A test of its errors against those of moves that the model was not trained on."""
+"""Does a log fit a model? A test of its errors against those of moves that were left out."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from sklearn.utils import Bunch
 
 from .joint_residual import JointResidual
 from .moves import free_effects
+from .rows_of_logs import correlation_time
+
+# Eigenvalues of a correlation that are rounding errors.
+_SINGULAR = 1e-10
 
 
 def check_of(
@@ -21,29 +25,41 @@ def check_of(
     probability: float,
 ) -> Bunch:
     """Return whether errors missed (n, o) with predicted std are those of an ordinary move; see `check_log`."""
-    # Two tests for each joint. The logarithm of the mean square, against those of left-out moves, by a t-test: errors
+    # Two tests for each joint. A t-test compares the logarithm of the mean square with those of left-out moves: errors
     # that are larger as a whole. And the effects d of the move, which other moves say are N(0, T): with the covariance
-    # C of their estimate, dᵀ (T + C)⁻¹ d / k has an F distribution. That finds a shift which is small beside the noise.
-    # Variances between moves are known from few moves of each joint, and relative to them all joints are alike, so that
-    # all count as degrees of freedom.
-    n_moves = max(len(joint.log_squares) for joint in joints)
-    dof = max(1, (n_moves - 1) * len(joints))
-    logs = np.array([joint.log_squares for joint in joints if len(joint.log_squares) == n_moves])
-    spread = float(np.sqrt(np.sum((logs - logs.mean(axis=1, keepdims=True)) ** 2) / dof))
-    values = []
-    for j, joint in enumerate(joints):
-        size = np.log(max(np.mean((missed[:, j] / std[:, j]) ** 2), 1e-300)) - joint.log_squares.mean()
-        larger = student.sf(size / (max(spread, 1e-9) * np.sqrt(1.0 + 1.0 / n_moves)), dof)
-        d, covariance = free_effects(z[j], missed[:, j], std[:, j], runs)
-        together = covariance + joint.effects.covariance
-        scale = np.sqrt(np.diag(together))
-        known = scale > 0.0
-        unit = together[np.ix_(known, known)] / np.outer(scale[known], scale[known])
-        moved = d[known] / scale[known]
-        k = int(known.sum())
-        shifted = fisher.sf(moved @ np.linalg.lstsq(unit, moved, rcond=1e-10)[0] / max(k, 1), max(k, 1), dof)
-        values.append(min(1.0, 2.0 * min(larger, shifted)))
-    p_values = np.array(values)
-    p_value = float(min(1.0, len(joints) * p_values.min()))
-    bad = [name for name, value in zip(names, p_values, strict=True) if len(joints) * value < probability]
-    return Bunch(fits=p_value >= probability, p_value=p_value, p_values=p_values, joints=bad)
+    # C of their estimate, dᵀ (T + C)⁻¹ d / k has an F distribution. That finds shifts smaller than the noise. Variances
+    # between moves are known from few moves of each joint. Relative to them all joints are alike, so that all count as
+    # degrees of freedom.
+    judged = [j for j, joint in enumerate(joints) if len(joint.log_squares) > 1]
+    logs = np.array([joints[j].log_squares for j in judged]).reshape(len(judged), -1)
+    n_moves = logs.shape[1] if judged else 1
+    dof = max(1, (n_moves - 1) * len(judged))
+    spread = float(np.sum((logs - logs.mean(axis=1, keepdims=True)) ** 2) / dof) if judged else 0.0
+    p_values = np.ones(len(joints))
+    for j, of_joint in zip(judged, logs, strict=True):
+        squares = (missed[:, j] / std[:, j]) ** 2
+        # To first order, the logarithm of the mean of n squares has this variance.
+        mean = max(float(squares.mean()), 1e-300)
+        sampling = squares.var() / mean**2 * correlation_time(squares - mean, runs) / len(squares)
+        error = np.sqrt(spread * (1.0 + 1.0 / n_moves) + sampling)
+        larger = student.sf((np.log(mean) - of_joint.mean()) / max(error, 1e-9), dof)
+        p_values[j] = min(1.0, 2.0 * min(larger, _shifted(joints[j], z[j], missed[:, j], std[:, j], runs, dof)))
+    together = np.minimum(1.0, len(judged) * p_values)
+    bad = [name for name, value in zip(names, together, strict=True) if value < probability]
+    return Bunch(fits=not bad, p_value=float(together.min()), p_values=p_values, joints=bad)
+
+
+def _shifted(
+    joint: JointResidual, z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray, dof: int
+) -> float:
+    """Return the probability of effects at least as large, in a move without training rows."""
+    d, covariance = free_effects(z, missed, std, runs)
+    covariance = covariance + joint.effects.covariance
+    scale = np.sqrt(np.diag(covariance))
+    d, scale, covariance = d[scale > 0.0], scale[scale > 0.0], covariance[np.ix_(scale > 0.0, scale > 0.0)]
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > _SINGULAR
+    if not kept.any():
+        return 1.0
+    squares = (vectors[:, kept].T @ (d / scale)) ** 2 / values[kept]
+    return float(fisher.sf(squares.mean(), len(squares), dof))

@@ -12,12 +12,12 @@ from .weights import Rows
 
 # Names of the effects of a move on a joint's torque, the columns of `terms`.
 EFFECTS = ("offset", "viscous", "coulomb", "gain")
-# Steps of expectation maximisation, in each of some rounds for the correlation of errors.
-_STEPS, _ROUNDS = 30, 4
-# Least share of the noise of left-out moves that is not the variation between moves.
-_OWN = 0.05
-# Blocks of a move differ less than moves do. With so few moves, variances are multiplied by 1 + 1 / (2 moves).
-_FEW = 2
+# Fewer moves do not tell how moves differ.
+FEWEST_MOVES = 3
+# Steps of expectation maximisation.
+_STEPS = 50
+# Shares of the variances that an update may use, and the part of a move that decides on them.
+_SHARES, _FIRST = (0.0, 0.01, 0.1, 1.0), 1.0 / 3.0
 
 
 class MoveEffects(NamedTuple):
@@ -25,6 +25,7 @@ class MoveEffects(NamedTuple):
 
     mean: np.ndarray  # (4,)
     covariance: np.ndarray  # (4, 4)
+    extra: float = 0.0  # variance that is added to the noise
 
     @classmethod
     def none(cls) -> MoveEffects:
@@ -32,7 +33,15 @@ class MoveEffects(NamedTuple):
 
     def moments(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and variance of the effects on rows with terms z (n, 4), (n,) each."""
-        return z @ self.mean, np.einsum("ni,ij,nj->n", z, self.covariance, z)
+        return z @ self.mean, np.einsum("ni,ij,nj->n", z, self.covariance, z) + self.extra
+
+
+class Variation(NamedTuple):
+    """How moves differ."""
+
+    effects: MoveEffects  # of a move without training rows
+    update: MoveEffects | None  # the prior of effects that rows of a move update, or None if these do not help
+    noise: JointNoise  # that is left within moves
 
 
 def terms(speed: np.ndarray, torque: np.ndarray, velocity: float) -> np.ndarray:
@@ -41,30 +50,68 @@ def terms(speed: np.ndarray, torque: np.ndarray, velocity: float) -> np.ndarray:
 
 
 def variation(
-    z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, rows: Rows
-) -> tuple[MoveEffects, JointNoise]:
-    """Find how moves differ, and the noise that is left, from what other moves predict wrongly, missed (n,)."""
+    z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, known: np.ndarray, rows: Rows
+) -> Variation:
+    """Find how moves differ, and the noise that is left, from errors (n,) of predictions by other moves."""
+    # known (n,) is the variance of the predictions. noise is that of the errors beside it.
+    #
     # Each move has its own effects d ~ N(0, diag(t)), as in a linear model with random effects. Expectation
     # maximisation finds the most likely t. Rows count less if errors are correlated in time, so that slow errors within
-    # a move are not taken for effects. At first all of the errors count as such, then what effects leave.
-    std = np.sqrt(noise.of(speed))
+    # a move are not taken for effects.
+    std, moves = np.sqrt(noise.of(speed) + known), [rows.groups == move for move in np.unique(rows.groups)]
+    within = np.empty_like(missed)
+    for own in moves:
+        within[own] = _without_effects(z[own] / std[own, np.newaxis], missed[own] / std[own])
+    share = min(1.0, float(np.sum(within**2) / max(1, len(within) - z.shape[1] * len(moves))))
+    scale = std * np.sqrt(share * correlation_time(within, rows.runs))
+    informations = [_information(z[own], missed[own], scale[own]) for own in moves]
     size = np.mean(z**2, axis=0)
     variance = np.where(size > 0.0, np.mean(missed**2) / np.where(size > 0.0, size, 1.0), 0.0)
-    moves = [rows.groups == move for move in np.unique(rows.groups)]
-    within = missed.copy()
-    for _ in range(_ROUNDS):
-        scale = std * np.sqrt(np.mean((within / std) ** 2) * correlation_time(within / std, rows.runs))
-        informations = [_information(z[own], missed[own], scale[own]) for own in moves]
-        for _ in range(_STEPS):
-            found = [_posterior(variance, *information) for information in informations]
-            variance = np.mean([d**2 + np.diag(covariance) for d, covariance in found], axis=0)
-        for own, (d, _) in zip(moves, found, strict=True):
-            within[own] = missed[own] - z[own] @ d
-    between = float(np.mean(z**2 @ variance / std**2)) * noise.variance
-    n_moves = rows.n_moves
-    factor = 1.0 + 0.5 / n_moves if n_moves <= _FEW else 1.0
-    left = noise._replace(variance=factor * max(noise.variance - between, _OWN * noise.variance))
-    return MoveEffects(np.zeros(len(variance)), factor * np.diag(variance)), left
+    for _ in range(_STEPS):
+        found = [_posterior(variance, *information) for information in informations]
+        variance = np.mean([d**2 + np.diag(covariance) for d, covariance in found], axis=0)
+    # Together effects and noise are as large as the errors of left-out moves.
+    between = float(np.mean(z**2 @ variance / noise.of(speed)))
+    inside = max(1.0 - between, share)
+    # Blocks of one or two moves differ less than moves do.
+    factor = (1.0 + 0.5 / rows.n_moves if rows.n_moves < FEWEST_MOVES else 1.0) / max(1.0, between + inside)
+    left = noise._replace(variance=factor * inside * noise.variance)
+    effects = MoveEffects(np.zeros(len(variance)), factor * np.diag(variance))
+    update = _update(effects, z, missed, speed, left, known, rows, moves) if rows.n_moves >= FEWEST_MOVES else None
+    return Variation(effects, update, left)
+
+
+def _update(
+    effects: MoveEffects,
+    z: np.ndarray,
+    missed: np.ndarray,
+    speed: np.ndarray,
+    noise: JointNoise,
+    known: np.ndarray,
+    rows: Rows,
+    moves: list[np.ndarray],
+) -> MoveEffects | None:
+    """Return the prior of effects that the first rows of moves update best, by the errors of the others."""
+    # As in `joint_residual`, moves decide, each of which counts the same: errors of the rest of a move must fall, and
+    # noise grows by what they are larger than they should be.
+    falls, sizes = np.zeros((len(_SHARES), len(moves))), np.ones((len(_SHARES), len(moves)))
+    for k, own in enumerate(moves):
+        chosen = np.flatnonzero(own)
+        first, rest = np.split(chosen, [int(_FIRST * len(chosen))])
+        if len(first) == 0:
+            continue
+        for s, share in enumerate(_SHARES):
+            prior = effects._replace(covariance=share * effects.covariance)
+            now = of_move(prior, z[first], missed[first], speed[first], noise, rows.runs[first])
+            mean, variance = now.moments(z[rest])
+            squares = (missed[rest] - mean) ** 2
+            falls[s, k] = np.log(max(float(np.mean(squares)), 1e-300))
+            sizes[s, k] = np.mean(squares / (variance + noise.of(speed[rest]) + known[rest]))
+    best = int(np.argmin(falls.mean(axis=1)))
+    if best == 0:
+        return None
+    extra = max(0.0, float(sizes[best].mean()) - 1.0) * noise.variance
+    return MoveEffects(effects.mean, _SHARES[best] * effects.covariance, extra)
 
 
 def of_move(
@@ -72,27 +119,35 @@ def of_move(
 ) -> MoveEffects:
     """Return the effects of a move after some of its rows, whose errors without effects are missed (n,)."""
     std = np.sqrt(noise.of(speed))
-    mean, covariance = before
-    for _ in range(_ROUNDS):
-        scale = std * np.sqrt(correlation_time((missed - z @ mean) / std, runs))
-        mean, covariance = _posterior(np.diag(before.covariance), *_information(z, missed, scale))
-    return MoveEffects(mean, covariance)
+    left = _without_effects(z / std[:, np.newaxis], missed / std)
+    scale = std * np.sqrt(correlation_time(left, runs))
+    found = _posterior(np.diag(before.covariance), *_information(z, missed, scale))
+    return MoveEffects(*found, before.extra)
 
 
 def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the effects of a move by least squares, and their covariance."""
-    scale = std * np.sqrt(correlation_time(missed / std, runs))
-    rows = z / scale[:, np.newaxis]
-    size = np.sqrt(np.sum(rows**2, axis=0))
+    left = _without_effects(z / std[:, np.newaxis], missed / std)
+    scale = std * np.sqrt(correlation_time(left, runs))
+    information, score = _information(z, missed, scale)
+    size = np.sqrt(np.diag(information))
     unit = np.where(size > 0.0, size, 1.0)
-    inverse = np.linalg.pinv((rows / unit).T @ (rows / unit), rcond=1e-8, hermitian=True) / np.outer(unit, unit)
-    return inverse @ (rows.T @ (missed / scale)), inverse
+    inverse = np.linalg.pinv(information / np.outer(unit, unit), rcond=1e-8, hermitian=True) / np.outer(unit, unit)
+    return inverse @ score, inverse
 
 
 def _information(z: np.ndarray, missed: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return ZᵀZ and Zᵀe of rows in units of their scale (n,)."""
     rows = z / scale[:, np.newaxis]
     return rows.T @ rows, rows.T @ (missed / scale)
+
+
+def _without_effects(z: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return the errors of a move, in standard deviations, without its effects, found by least squares."""
+    size = np.sqrt(np.sum(z**2, axis=0))
+    unit = z / np.where(size > 0.0, size, 1.0)
+    left: np.ndarray = errors - unit @ np.linalg.lstsq(unit, errors, rcond=1e-8)[0]
+    return left
 
 
 def _posterior(variance: np.ndarray, information: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What a log cannot tell: joints at rest, joints without a motor, too little motion."""
+"""Warnings about logs with too little information: joints at rest, joints without a motor, little motion."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from .weights import Rows, Weights
 
 # A joint whose torque is below this share of what the robot's model needs is not driven.
 _NOT_DRIVEN = 0.1
+# A joint that is never faster is at rest, rad/s or m/s.
+_REST = 0.01
 # Least number of independent rows for each combination of weights that they determine.
 _ROWS_PER_WEIGHT = 3.0
 
@@ -17,7 +19,7 @@ def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
     said = []
     prior = weights.prior
     fastest = np.abs(rows.speed).max(axis=0)
-    still = fastest < prior.velocity
+    still = fastest < _REST
     if still.any():
         said.append(
             f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s), so that nothing is "
@@ -30,8 +32,8 @@ def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
         share = 100.0 * (torque[idle] / needed[idle]).max()
         said.append(
             f"Torques of {_of(names, idle)} are at most {share:.1f} % of what the robot's model needs for this motion. "
-            "Either their motors were off, and the model will be wrong where they are on, or the masses of the robot's "
-            "model are far too large."
+            "Either their motors were off, and the model will be wrong where they are on, or y has another unit, or "
+            "the masses of the robot's model are far too large."
         )
     worth = float(np.sum(len(rows.targets) / weights.correlation_time))
     if worth < _ROWS_PER_WEIGHT * weights.determined:

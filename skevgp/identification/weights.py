@@ -154,6 +154,7 @@ class Fold(NamedTuple):
 
     out: np.ndarray  # (n,) whether a row was left out
     torques: np.ndarray  # (n, o) of all rows
+    variance: np.ndarray  # (n_out, o) of the torques of these rows, by the weights' uncertainty
 
 
 def folds(rows: Rows, weights: Weights) -> list[Fold]:
@@ -162,7 +163,8 @@ def folds(rows: Rows, weights: Weights) -> list[Fold]:
     for block in np.unique(rows.blocks):
         out = rows.blocks == block
         kept = rows[~out] if not out.all() else rows
-        found.append(Fold(out, identify(kept, weights.prior, start=weights).predict(rows.features)))
+        own = identify(kept, weights.prior, start=weights)
+        found.append(Fold(out, own.predict(rows.features), own.variance(rows.features[out])))
     return found
 
 

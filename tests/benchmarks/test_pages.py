@@ -48,6 +48,7 @@ PAGES = {
     "physics_curves": ("physics", lambda own, rows: own.tables_of_curves(rows)),
     "machines": ("machines", lambda own, rows: own.inverse_tables(rows)),
     "machines_forward": ("machines", lambda own, rows: own.forward_tables(rows)),
+    "machines_check": ("machines", lambda own, rows: own.check_tables(rows)),
     "machines_contact": ("machines", lambda own, rows: own.contact_tables(rows)),
     "physics_wrong": ("physics", lambda own, rows: own.tables_of_wrong(rows)),
     "physics_rollouts": ("physics", lambda own, rows: own.tables_of_rollouts(rows)),

@@ -112,7 +112,15 @@ def test_invalid_use_raises(model):
             ContactMonitor(model, dt=wrong).fit(X, y)
         with pytest.raises(ValueError, match="false_alarms_per_hour"):
             fresh(false_alarms_per_hour=wrong).fit(X, y)
+    with pytest.raises(TypeError, match="must be a fitted InverseDynamics; got str"):
+        ContactMonitor("pendulum").fit(X, y)
+    with pytest.raises(NotFittedError):
+        fresh().reset()
     monitor = fresh().fit(X, y)
+    before = monitor.score_samples(X, y)
+    with pytest.raises(ValueError, match="needs at least"):
+        monitor.fit(X[:300], y[:300])
+    assert_array_equal(monitor.score_samples(X, y), before)  # a fit that fails changes nothing
     with pytest.raises(ValueError, match="pieces"):
         monitor.predict(X, y, pieces=[0, 1])
     with pytest.raises(ValueError, match="features"):

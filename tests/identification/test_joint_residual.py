@@ -6,7 +6,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from skevgp import InverseDynamics
 from skevgp.identification.joint_residual import _share
-from skevgp.identification.weights import Fold
 from tests.test_inverse_dynamics import trajectory
 
 
@@ -83,11 +82,10 @@ def test_mean_is_less_where_it_is_uncertain_and_0_far_from_rows(useful):
 
 def test_share_is_that_of_left_out_moves_and_chance_rarely_passes():
     rng, moves = np.random.default_rng(0), np.repeat(np.arange(5), 40)
-    folds = [Fold(moves == move, np.zeros(len(moves))) for move in range(5)]
 
     def share(size, truth):
         mean = size * np.repeat(rng.normal(size=20), 10)
-        return _share(truth * mean + rng.normal(size=len(mean)), mean, np.ones(len(mean)), folds)
+        return _share(truth * mean + rng.normal(size=len(mean)), mean, np.ones(len(mean)), moves)
 
     assert np.mean([share(10.0, 0.6) for _ in range(20)]) == pytest.approx(0.6, abs=0.03)
     # The probability that a useless f is kept is 5 %. Without a test it would be a half.

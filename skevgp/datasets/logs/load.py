@@ -463,7 +463,8 @@ def _warn_of_delays(recordings: list[Bunch]) -> None:
     if late:
         told = ", ".join(f"{1e3 * delay:.1f} ms in {filename}" for filename, delay in late.items())
         warn_user(
-            f"Efforts lag behind positions by {told}. This was corrected. Pass delay=0.0 to keep the times.",
+            f"Efforts lag behind positions by {told} (below 0: they are ahead). This was corrected. Pass delay=0.0 to "
+            "keep the times.",
             RobotModelWarning,
         )
 
