@@ -12,7 +12,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from ..estimators.evgp import EVGPRegressor
 from ..kernels.parse import KernelSpec
-from .moves import MoveEffects, terms, variation
+from .moves import FEWEST_MOVES, MoveEffects, terms, variation
 from .stiction import JointNoise, likeliest_noise, noise_at
 from .weights import Fold, Rows
 
@@ -141,7 +141,7 @@ def fit_joint_residual(
         kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _ROWS_OF_TRIAL)).astype(int))]
         trial.fit(x[kept], (target - fold.torques)[kept], relative_variance=relative[kept])
         mean[fold.out], variance[fold.out] = trial.faded(x[fold.out])
-    share = _share(missed, mean, relative, rows.groups)
+    share = _share(missed, mean, relative, rows.groups if rows.n_moves >= FEWEST_MOVES else rows.blocks)
     if share == 0.0:
         return ended(None, 0.0, missed, np.zeros(len(x)))
     model.fit(x[some], residual[some], relative_variance=relative[some])

@@ -28,13 +28,17 @@ def check_of(
     # Two tests for each joint. A t-test compares the logarithm of the mean square with those of left-out moves: errors
     # that are larger as a whole. And the effects d of the move, which other moves say are N(0, T): with the covariance
     # C of their estimate, dᵀ (T + C)⁻¹ d / k has an F distribution. That finds shifts smaller than the noise. Variances
-    # between moves are known from few moves of each joint. Relative to them all joints are alike, so that all count as
-    # degrees of freedom.
+    # between moves are known from few moves of each joint. Relative to the noise all joints are taken as alike: all
+    # count as degrees of freedom, and effects of a joint are at least as large as those of all joints in the mean.
     judged = [j for j, joint in enumerate(joints) if len(joint.log_squares) > 1]
     logs = np.array([joints[j].log_squares for j in judged]).reshape(len(judged), -1)
     n_moves = logs.shape[1] if judged else 1
     dof = max(1, (n_moves - 1) * len(judged))
     spread = float(np.sum((logs - logs.mean(axis=1, keepdims=True)) ** 2) / dof) if judged else 0.0
+    sizes = np.array([np.mean(of_joint**2, axis=0) / joints[j].noise.variance for j, of_joint in enumerate(z)])
+    variances = np.array([np.diag(joint.effects.covariance) for joint in joints])
+    usual = np.mean((variances * sizes)[judged], axis=0)
+    variances = np.maximum(variances, np.where(sizes > 0.0, usual / np.where(sizes > 0.0, sizes, 1.0), 0.0))
     p_values = np.ones(len(joints))
     for j, of_joint in zip(judged, logs, strict=True):
         squares = (missed[:, j] / std[:, j]) ** 2
@@ -43,18 +47,18 @@ def check_of(
         sampling = squares.var() / mean**2 * correlation_time(squares - mean, runs) / len(squares)
         error = np.sqrt(spread * (1.0 + 1.0 / n_moves) + sampling)
         larger = student.sf((np.log(mean) - of_joint.mean()) / max(error, 1e-9), dof)
-        p_values[j] = min(1.0, 2.0 * min(larger, _shifted(joints[j], z[j], missed[:, j], std[:, j], runs, dof)))
+        p_values[j] = min(1.0, 2.0 * min(larger, _shifted(variances[j], z[j], missed[:, j], std[:, j], runs, dof)))
     together = np.minimum(1.0, len(judged) * p_values)
     bad = [name for name, value in zip(names, together, strict=True) if value < probability]
     return Bunch(fits=not bad, p_value=float(together.min()), p_values=p_values, joints=bad)
 
 
 def _shifted(
-    joint: JointResidual, z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray, dof: int
+    variance: np.ndarray, z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray, dof: int
 ) -> float:
     """Return the probability of effects at least as large, in a move without training rows."""
     d, covariance = free_effects(z, missed, std, runs)
-    covariance = covariance + joint.effects.covariance
+    covariance = covariance + np.diag(variance)
     scale = np.sqrt(np.diag(covariance))
     d, scale, covariance = d[scale > 0.0], scale[scale > 0.0], covariance[np.ix_(scale > 0.0, scale > 0.0)]
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
