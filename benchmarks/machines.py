@@ -12,7 +12,8 @@ documentation says how to add a machine.
 
 *inverse*: models of joint torques. Splits have moves to train on and moves to test on, whole. Least squares are the
 rigid-body features with friction, by `numpy.linalg.lstsq`. "updated" is `InverseDynamics` after `update` with the first
-third of each test move; its scores, and those of least squares that it is compared with, are of the rest.
+third of each test move; its scores, and those of least squares that it is compared with, are of the rest. It needs
+three moves to train on.
 
 *forward*: models of the state after 20 ms, with `EVGPRegressor`'s defaults. Signals are filtered with 15 Hz. Rollouts
 are of a second, with the recorded torques, from 20 states of each test move.
@@ -495,7 +496,9 @@ def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
     if part == "forward":
         machines = [machine for machine in machines if machine in ("double pendulum, 15 Hz", "simple pendulum")]
         return [Forward(m, split, model, size) for m in machines for split in MACHINES[m].splits for model in FORWARD]
-    return [Inverse(m, split, model, size) for m in machines for split in MACHINES[m].splits for model in INVERSE]
+    cells = [Inverse(m, split, model, size) for m in machines for split in MACHINES[m].splits for model in INVERSE]
+    # Updates need three moves to train on.
+    return [cell for cell in cells if cell.model != UPDATED or len(MACHINES[cell.robot].splits[cell.split][0]) > 2]
 
 
 PARTS = {  # CSV, function, tables, title
