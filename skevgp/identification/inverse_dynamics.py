@@ -123,7 +123,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Speed below which the sign of friction is not known, rad/s or m/s.
     move_scale_ : ndarray of shape (n_outputs, 4)
         Standard deviations between moves: of the offset, of viscous friction, of Coulomb friction and of the relative
-        error of the gain.
+        error of the gain. With few moves they are larger than those that were seen.
     move_ : ndarray of shape (n_outputs, 4)
         These effects in the move that `update` was given, else 0.
     n_iter_ : int

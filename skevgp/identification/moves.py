@@ -78,7 +78,9 @@ def variation(
     left = noise._replace(variance=factor * inside * noise.variance)
     effects = MoveEffects(np.zeros(len(variance)), factor * np.diag(variance))
     update = _update(effects, z, missed, speed, left, known, rows, moves) if rows.n_moves >= FEWEST_MOVES else None
-    return Variation(effects, update, left)
+    # Few moves say little about variances: those of a new move are larger by as much as for Student's t distribution.
+    wider = effects._replace(covariance=(1.0 + 2.0 / rows.n_moves) * effects.covariance)
+    return Variation(wider, update, left)
 
 
 def _update(

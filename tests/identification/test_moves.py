@@ -106,12 +106,11 @@ def test_slow_errors_within_a_move_are_no_effects():
 
 def test_variances_of_few_moves_are_multiplied():
     log = Moves([0.0, 0.0, 0.0, 0.01], n_moves=5)
-    found, left, _ = log.variation(3)
-    assert_allclose(log.variation(5)[0], found)
-    for n_moves, factor in ((1, 1.5), (2, 1.25)):
+    found, left, _ = log.variation(1000)
+    for n_moves, factor, blocks in ((1, 3.0, 1.5), (2, 2.0, 1.25), (3, 1.0 + 2.0 / 3.0, 1.0), (10, 1.2, 1.0)):
         more, noise, _ = log.variation(n_moves)
-        assert_allclose(more, factor * found)
-        assert noise == pytest.approx(factor * left)
+        assert_allclose(more, factor * blocks / 1.002 * found)
+        assert noise == pytest.approx(blocks * left)
 
 
 def test_terms_that_are_zero_have_no_effects():
