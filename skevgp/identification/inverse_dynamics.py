@@ -148,7 +148,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as large as the
     residuals, and its length scales are at most three standard deviations of their column and, except that of the
     speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn. Weights
-    and f_j are then fitted anew. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that errors
+    and f_j are then fitted again. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that errors
     fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j fades.
     Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
 

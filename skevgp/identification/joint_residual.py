@@ -132,7 +132,7 @@ def fit_joint_residual(
     sharp = noise_at(residual, speed, noise.coulomb, velocity, least)
     relative = sharp.of(speed) / sharp.variance
     model = QuietRegressor(kernel=kernel, noise_cv=None, **options)
-    # Each move is predicted by a fit to the others. It starts anew: parameters of the last search know the move.
+    # Each move is predicted by a fit to the others. It starts again: parameters of the last search know the move.
     mean, variance = np.empty(len(x)), np.empty(len(x))
     iterations = model.max_iter if model.max_iter is not None else _ITERATIONS_OF_TRIAL
     trial = clone(model).set_params(max_iter=min(iterations, _ITERATIONS_OF_TRIAL))

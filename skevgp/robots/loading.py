@@ -107,7 +107,7 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
 
 
 def known_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
-    """A robot as `load_robot` gives it, without warnings: for who loads it a second time, or needs no inertia."""
+    """A robot as `load_robot` gives it, without warnings: for callers that load it again, or need no inertia."""
     model = _read(robot)[0]
     return model if joints is None else _with_locked(model, joints)
 
