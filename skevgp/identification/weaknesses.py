@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .rows_of_logs import correlation_time
 from .weights import Rows, Weights
 
 # A joint whose torque is below this share of what the robot's model needs is not driven.
@@ -35,7 +36,10 @@ def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
             "Either their motors were off, and the model will be wrong where they are on, or y has another unit, or "
             "the masses of the robot's model are far too large."
         )
-    worth = float(np.sum(len(rows.targets) / weights.correlation_time))
+    errors = rows.targets - weights.predict(rows.features)
+    for move in np.unique(rows.groups) if rows.n_moves > 1 else []:  # its offset says nothing of the rows inside
+        errors[rows.groups == move] -= errors[rows.groups == move].mean(axis=0)
+    worth = sum(len(errors) / correlation_time(column, rows.runs) for column in errors.T)
     if worth < _ROWS_PER_WEIGHT * weights.determined:
         said.append(
             f"Rows that follow each other are correlated: {rows.targets.size} torques tell as much as {worth:.0f} "
