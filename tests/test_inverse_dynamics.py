@@ -103,7 +103,8 @@ def test_joints_own_columns_tell_what_physics_missed():
     assert np.exp(np.mean(np.log(error(model) / error(arm.fit(n_inducing=0))))) < 0.7
     mean, std = model.predict(arm.new, return_std=True)
     assert (np.mean(np.abs(truth - mean) < 2.0 * std, axis=0) > 0.85).all()
-    assert (model.residual_std_ > 0.0).all()
+    # Where few moves do not confirm a Gaussian process at 5 %, there is none.
+    assert (model.residual_std_ > 0.0).sum() >= 4
 
 
 def carrying(arm, model, seed, gains=1.0, mass=2.0):
