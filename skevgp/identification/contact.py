@@ -1,4 +1,4 @@
-"""ContactMonitor: alarms for contact of a robot, with a stated rate of false alarms."""
+"""ContactMonitor: alarms for contact of a robot, with a limited rate of false alarms."""
 
 from __future__ import annotations
 
@@ -120,8 +120,8 @@ class ContactMonitor(StatefulEstimator):
         Raises
         ------
         ValueError, TypeError
-            If an argument is out of its range, the model is no `InverseDynamics`, or the rows without the first 0.8 s
-            of each piece are fewer than 16 s.
+            If an argument is out of its range, the model is not an `InverseDynamics`, or the rows without the first
+            0.8 s of each piece are fewer than 16 s.
         """
         if not isinstance(self.model, InverseDynamics):
             raise TypeError(f"model must be a fitted InverseDynamics; got {type(self.model).__name__}.")
@@ -140,7 +140,6 @@ class ContactMonitor(StatefulEstimator):
         self._window = _WINDOWS * self._lengths[-1]
         parts = [part for part in parts if len(part) >= self._window]
         self._filters = np.stack([self._matched(products) for products in self._covariances(parts, z.shape[1])])
-        self.scale_ = np.ones(self._filters.shape[:2])
         filtered = [self._filtered(part) for part in parts]
         block = max(1, round(_APART / step))
         judged = sum(len(one) for one in filtered)

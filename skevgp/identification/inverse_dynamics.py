@@ -29,7 +29,8 @@ from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
 from .log_check import check_of
-from .moves import FEWEST_MOVES, of_move, terms
+from .moves import FEWEST_MOVES, MoveEffects, of_move, terms
+from .rows_of_logs import evenly_spread
 from .weaknesses import weaknesses
 from .weights import Fold, Rows, condensed, folds
 
@@ -339,7 +340,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         for part in parts:
             guessed[part.out] = part.torques[part.out]
         residual = y - weights.predict(rows.features)
-        some = np.unique(np.linspace(0, len(y) - 1, min(len(y), self.max_rows)).astype(int))
+        some = evenly_spread(len(y), self.max_rows)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         options = {"n_inducing": self.n_inducing, "max_iter": self.max_iter, "random_state": seed}
         smooth = np.array([True, False, True, True]) if self._has_robot else np.zeros(X.shape[1], dtype=bool)
@@ -408,19 +409,36 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_is_fitted(self)
         rows: np.ndarray = validate_numbers(self, X, reset=False, dtype=np.float64)
         check_magnitude(rows, "X")
-        n_outputs = len(self._joints)
-        features = self._features(rows, n_outputs)
+        features, speed = self._features(rows, len(self._joints)), self._speed(rows, len(self._joints))
+        moves = [joint.move for joint in self._joints]
+        mean, variance = self._moments(rows, features, speed, moves)
+        if not return_std:
+            return self._like_y(mean)
+        variance += self._weights.variance(features)
+        if include_noise:
+            variance += self._noise(speed)
+        return self._like_y(mean), self._like_y(np.sqrt(variance))
+
+    def _moments(
+        self, X: np.ndarray, features: np.ndarray, speed: np.ndarray, moves: list[MoveEffects]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean of torques, and the variance by f_j and effects of moves, (n, o) each."""
         physics = self._weights.predict(features)
-        speed = self._speed(rows, n_outputs)
-        mean, variance = physics.copy(), self._weights.variance(features) if return_std else np.zeros_like(physics)
-        for j, joint in enumerate(self._joints):
-            z = terms(speed[:, j], physics[:, j], joint.noise.velocity)
-            for more, uncertain in (joint.moments(self._own(rows, physics, j)), joint.move.moments(z)):
+        mean, variance = physics.copy(), np.zeros_like(physics)
+        for j, (joint, move, z) in enumerate(zip(self._joints, moves, self._terms(physics, speed), strict=True)):
+            for more, uncertain in (joint.moments(self._own(X, physics, j)), move.moments(z)):
                 mean[:, j] += more
                 variance[:, j] += uncertain
-            if include_noise:
-                variance[:, j] += joint.noise.of(speed[:, j])
-        return (self._like_y(mean), self._like_y(np.sqrt(variance))) if return_std else self._like_y(mean)
+        return mean, variance
+
+    def _terms(self, physics: np.ndarray, speed: np.ndarray) -> list[np.ndarray]:
+        """Return z of each joint, (n, 4)."""
+        columns = zip(self._joints, speed.T, physics.T, strict=True)
+        return [terms(v, torque, joint.noise.velocity) for joint, v, torque in columns]
+
+    def _noise(self, speed: np.ndarray) -> np.ndarray:
+        """Return the variance of the noise, (n, o)."""
+        return np.column_stack([joint.noise.of(v) for joint, v in zip(self._joints, speed.T, strict=True)])
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         return like_y(values) if self._one_dimensional else values
@@ -543,15 +561,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             )
         rows_x, targets = self._new_log(X, y)
         rows = self._as_rows(rows_x, targets, None, pieces)
-        physics = self._weights.predict(rows.features)
-        variance = self._weights.variance(rows.features)
-        missed, z = targets - physics, []
-        for j, joint in enumerate(self._joints):
-            z.append(terms(rows.speed[:, j], physics[:, j], joint.noise.velocity))
-            mean, own = joint.moments(self._own(rows_x, physics, j))
-            missed[:, j] -= mean
-            variance[:, j] += own + joint.effects.moments(z[j])[1] + joint.noise.of(rows.speed[:, j])
-        return rows, missed, np.sqrt(variance), z
+        moves = [joint.effects for joint in self._joints]
+        mean, variance = self._moments(rows_x, rows.features, rows.speed, moves)
+        variance += self._weights.variance(rows.features) + self._noise(rows.speed)
+        z = self._terms(self._weights.predict(rows.features), rows.speed)
+        return rows, targets - mean, np.sqrt(variance), z
 
     def summary(self) -> ModelSummary:
         """Summarise the fit: weights with their prior, noise, and the residual of each joint.

@@ -13,6 +13,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from ..estimators.evgp import EVGPRegressor
 from ..kernels.parse import KernelSpec
 from .moves import FEWEST_MOVES, MoveEffects, terms, variation
+from .rows_of_logs import evenly_spread
 from .stiction import JointNoise, likeliest_noise, noise_at
 from .weights import Fold, Rows
 
@@ -104,7 +105,7 @@ def fit_joint_residual(
         physics[fold.out], known[fold.out] = fold.torques[fold.out], fold.variance
         missed[fold.out] = (target - fold.torques)[fold.out]
 
-    def ended(model: QuietRegressor | None, share: float, missed: np.ndarray, own: np.ndarray) -> JointResidual:
+    def with_moves(model: QuietRegressor | None, share: float, missed: np.ndarray, own: np.ndarray) -> JointResidual:
         # The variance of errors is that of f, own (n,), of effects of moves, and of noise. That of weights, which few
         # rows have, counts as noise too: errors of new moves are larger than those of left-out ones.
         found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
@@ -123,7 +124,7 @@ def fit_joint_residual(
         found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, noise.variance)
         return JointResidual(None, found, 0.0, nothing, None, nothing, np.zeros(0))
     if not options["n_inducing"]:
-        return ended(None, 0.0, missed, np.zeros(len(x)))
+        return with_moves(None, 0.0, missed, np.zeros(len(x)))
     spread = x[some].std(axis=0)
     spread = np.where(spread > 1e-9 * np.abs(x[some]).max(axis=0), spread, 1.0)
     shortest = np.where(smooth, _SHORTEST, _SHORTEST_OF_SPEED)
@@ -138,14 +139,14 @@ def fit_joint_residual(
     trial = clone(model).set_params(max_iter=min(iterations, _ITERATIONS_OF_TRIAL))
     for fold in folds:
         kept = np.flatnonzero(~fold.out if not fold.out.all() else fold.out)
-        kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), _ROWS_OF_TRIAL)).astype(int))]
+        kept = kept[evenly_spread(len(kept), _ROWS_OF_TRIAL)]
         trial.fit(x[kept], (target - fold.torques)[kept], relative_variance=relative[kept])
         mean[fold.out], variance[fold.out] = trial.faded(x[fold.out])
     share = _share(missed, mean, relative, rows.groups if rows.n_moves >= FEWEST_MOVES else rows.blocks)
     if share == 0.0:
-        return ended(None, 0.0, missed, np.zeros(len(x)))
+        return with_moves(None, 0.0, missed, np.zeros(len(x)))
     model.fit(x[some], residual[some], relative_variance=relative[some])
-    return ended(model, share, missed - share * mean, share**2 * variance)
+    return with_moves(model, share, missed - share * mean, share**2 * variance)
 
 
 def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, moves: np.ndarray) -> float:

@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from ..data.threads import single_threaded_libraries
 from ..robots import RigidBody
 from ..robots.loading import joint_axes
+from .rows_of_logs import evenly_spread
 
 _ROWS, _ROWS_OF_SEARCH = 400, 200
 # Robots of many joints use fewer rows. With more joints than the last number, only limits of positions are compared.
@@ -57,7 +58,7 @@ def likely_causes(
     if n_joints > _MOST_JOINTS:
         return _of_limits(said, degrees)
     n_rows = min(len(X), _ROWS, max(_LEAST_ROWS, _TORQUES // n_joints))
-    some = np.unique(np.linspace(0, len(X) - 1, n_rows).astype(int))
+    some = evenly_spread(len(X), n_rows)
     trial = _Trial(feature_map, prior, X[some], y[some])
     before, tried = trial.left(trial.X, trial.y), _degrees(trial, degrees)
     best = min(tried, key=lambda one: one.left, default=None)
@@ -201,7 +202,7 @@ def _order(trial: _Trial, X: np.ndarray) -> list[str]:
     n = len(trial.names)
     if n == 1:
         return []
-    some = np.unique(np.linspace(0, len(X) - 1, min(len(X), _ROWS_OF_SEARCH)).astype(int))
+    some = evenly_spread(len(X), _ROWS_OF_SEARCH)
     x, y = X[some], trial.y[some]
     found = {
         "X and y": _best_order(trial.names, lambda order: np.trace(trial.costs(_taken(x, order), y[:, order]))),

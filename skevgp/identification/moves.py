@@ -120,22 +120,25 @@ def of_move(
     before: MoveEffects, z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, runs: np.ndarray
 ) -> MoveEffects:
     """Return the effects of a move after some of its rows, whose errors without effects are missed (n,)."""
-    std = np.sqrt(noise.of(speed))
-    left = _without_effects(z / std[:, np.newaxis], missed / std)
-    scale = std * np.sqrt(correlation_time(left, runs))
-    found = _posterior(np.diag(before.covariance), *_information(z, missed, scale))
-    return MoveEffects(*found, before.extra)
+    information = _of_correlated(z, missed, np.sqrt(noise.of(speed)), runs)
+    return MoveEffects(*_posterior(np.diag(before.covariance), *information), before.extra)
 
 
 def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the effects of a move by least squares, and their covariance."""
-    left = _without_effects(z / std[:, np.newaxis], missed / std)
-    scale = std * np.sqrt(correlation_time(left, runs))
-    information, score = _information(z, missed, scale)
+    information, score = _of_correlated(z, missed, std, runs)
     size = np.sqrt(np.diag(information))
     unit = np.where(size > 0.0, size, 1.0)
     inverse = np.linalg.pinv(information / np.outer(unit, unit), rcond=1e-8, hermitian=True) / np.outer(unit, unit)
     return inverse @ score, inverse
+
+
+def _of_correlated(
+    z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ZᵀZ and Zᵀe of the rows of a move. Rows count less if the errors that effects leave are correlated."""
+    left = _without_effects(z / std[:, np.newaxis], missed / std)
+    return _information(z, missed, std * np.sqrt(correlation_time(left, runs)))
 
 
 def _information(z: np.ndarray, missed: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

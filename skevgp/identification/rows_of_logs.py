@@ -29,6 +29,11 @@ def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:
     return float(np.clip(2.0 * positive.sum() - 1.0, 1.0, len(errors)))
 
 
+def evenly_spread(n_rows: int, most: int) -> np.ndarray:
+    """Return the indices of at most so many rows."""
+    return np.unique(np.linspace(0, n_rows - 1, min(n_rows, most)).astype(int))
+
+
 def blocks_of(groups: np.ndarray | None, n_rows: int) -> np.ndarray:
     """Return labels (n,) from 0 of rows that are left out together: whole groups, or blocks of successive rows."""
     # Blocks are used if there are fewer than three groups, or one has half of the rows or more. If there are more
