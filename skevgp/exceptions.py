@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import RLock
 
-__all__ = ["DependentRowsWarning", "InconsistentVersionWarning", "RobotModelWarning"]
+__all__ = ["DependentRowsWarning", "InconsistentVersionWarning", "RobotModelWarning", "UnidentifiedWarning"]
 
 _filters = RLock()
 
@@ -72,6 +72,24 @@ class RobotModelWarning(UserWarning):
     >>> from skevgp.exceptions import RobotModelWarning
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", RobotModelWarning)
+    """
+
+
+class UnidentifiedWarning(UserWarning):
+    """The data do not identify a parameter of the feature map: its posterior is its prior.
+
+    `EVGPRegressor.fit` and `EGPRegressor.fit` give it.
+
+    See Also
+    --------
+    skevgp.features.ParametricFeatures : Features with parameters.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from skevgp.exceptions import UnidentifiedWarning
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", UnidentifiedWarning)
     """
 
 

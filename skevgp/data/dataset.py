@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -66,6 +66,11 @@ class Dataset:
         maps = Maps(feature_map, kernel_map, example, X.shape[1], getattr(estimator, "feature_names_in_", None))
         source = _source(given, X, y, maps, chosen)
         return cls(given, X, y, chosen, maps, source, None if groups is None else chosen.labels_of(groups))
+
+    def through(self, feature_map: Any) -> Dataset:
+        """The same rows through another fitted feature map."""
+        maps = replace(self.maps, feature_map=feature_map)
+        return replace(self, maps=maps, source=_source(self.given, self.X, self.y, maps, self.chosen))
 
     @classmethod
     def further(

@@ -22,6 +22,7 @@ from ..fitting.exact import ExactFit
 from ..fitting.fit import Fitted
 from ..fitting.prior import CoefPrior, as_coef_prior, coef_names
 from ..fitting.problem import Problem
+from ..fitting.theta import Calibration, ThetaPosterior, restricted
 from ..kernels.parse import KernelSpec
 from ..noise import as_noise
 from ..noise.base import Noise
@@ -41,6 +42,8 @@ _OF_WEIGHTS = (
     "coef_prior_scale_",
     "coef_groups_",
 )
+# Attributes of models whose feature map has parameters.
+_OF_THETA = ("theta_", "theta_std_", "theta_cov_")
 # Attributes that are computed when they are read.
 _AFTER_FIT = ("lower_bound_", "upper_bound_")
 # Arguments of version 0.1, and their new places.
@@ -88,6 +91,8 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
 
     _posterior: Posterior
     _fitted: Fitted | ExactFit
+    # The posterior of the parameters of the feature map, if it has any.
+    _theta: ThetaPosterior | None = None
 
     def predict(
         self,
@@ -246,6 +251,8 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             raise AttributeError(
                 f"{kind} has {name} only after a fit with a feature_map: without one there are no weights."
             )
+        if name in _OF_THETA:
+            raise AttributeError(f"{kind} has {name} only after a fit with a feature_map that has parameters.")
         if name in _AFTER_FIT and not self.__sklearn_is_fitted__():
             raise AttributeError(f"{kind} has {name} only after fit.")
         raise AttributeError(f"{kind!r} object has no attribute {name!r}")
@@ -278,18 +285,29 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         # A y of one column has no axis of outputs, as in scikit-learn's GPR.
         return len(self._posterior.predictor.noise)
 
-    def _set_posterior(self, data: Dataset, problem: Problem, spec: KernelSpec, fitted: Fitted | ExactFit) -> None:
+    def _set_posterior(
+        self,
+        data: Dataset,
+        problem: Problem,
+        spec: KernelSpec,
+        fitted: Fitted | ExactFit,
+        calibration: Calibration | None = None,
+    ) -> None:
         """Store the posterior of a fit, and the attributes that describe it."""
-        for name in _OF_WEIGHTS:
+        for name in (*_OF_WEIGHTS, *_OF_THETA):
             self.__dict__.pop(name, None)
         maps = replace(data.maps, shapes=problem.shapes)
         self.feature_map_, self.kernel_map_, self._fitted = maps.feature_map, maps.kernel_map, fitted
+        self._theta = None
+        if calibration is not None:
+            self.feature_map_, self._theta = maps.feature_map.feature_map, calibration.posterior
         self._posterior = Posterior(fitted.predictor(), maps)
         self._set_weights_and_noise()
         predictor, prior = self._posterior.predictor, fitted.prior
         if self.feature_map_ is not None:
             first = 0 if self._n_outputs == 1 or predictor.shared else slice(None)
             self.coef_names_ = coef_names(self.feature_map_, maps.columns, self.coef_.shape[-1])
+            prior = restricted(prior, self.coef_.shape[-1])
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
             labels = np.array([*prior.labels, ""], dtype=object)
             self.coef_groups_ = labels[np.full(prior.scale.shape, -1) if prior.groups is None else prior.groups][first]
@@ -310,7 +328,12 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         if self.feature_map_ is not None:
             mean, covariance = predictor.coefficients()
             first = 0 if self._n_outputs == 1 or predictor.shared else slice(None)
-            self.coef_, self.coef_cov_ = mean[first], covariance[first]
+            p = mean.shape[1]
+            if self._theta is not None:
+                # The columns of the linearisation have weights too, which are no weights of features.
+                p -= len(self._posterior.maps.feature_map.columns)
+                self.theta_, self.theta_std_, self.theta_cov_ = self._theta.attributes()
+            self.coef_, self.coef_cov_ = mean[first, ..., :p], covariance[first, ..., :p, :p]
             self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
         self.noise_variance_: Any = float(predictor.noise[0]) if self._n_outputs == 1 else predictor.noise.copy()
 

@@ -22,6 +22,7 @@ from ..fitting.messages import interrupted
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem
 from ..fitting.start import prior_predictor
+from ..fitting.theta import calibrate
 from ..noise import Gaussian, as_noise
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
@@ -30,6 +31,8 @@ from .base import GaussianProcess, names_moved_arguments
 
 # Number of rows up to which an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
+# Fits with parameters of the feature map begin with a tolerance of so many nats per row.
+_ROUGH_TOL = 1e-3
 
 
 class EGPRegressor(GaussianProcess):
@@ -61,6 +64,8 @@ class EGPRegressor(GaussianProcess):
     alpha : float, default=None
         Known noise variance, which is not learned. If rows differ, pass their mean here, and their variances in units
         of it as ``relative_variance`` of `fit`. ``std`` includes it.
+    discrepancy : {"free", "orthogonal"}, default="free"
+        Whether f may imitate the features, as in `EVGPRegressor`.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y instead of 0. If y is constant, the signal has a standard
         deviation of 1.
@@ -97,6 +102,11 @@ class EGPRegressor(GaussianProcess):
         Prior means and standard deviations of the weights. The latter are learned (see `CoefPrior`).
     coef_groups_ : ndarray of str of the shape of ``coef_``
         Label of the group of each weight, or empty if its prior standard deviation is not learned.
+    theta_, theta_std_ : dict of str to float
+        Posterior medians and standard deviations of the parameters of the feature map. Only if it has any, such as
+        `skevgp.features.ParametricFeatures`.
+    theta_cov_ : ndarray of shape (n_theta, n_theta)
+        Posterior covariance of the parameters, in the order of ``theta_``.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     kernel_ : Kernel, or list of Kernel for several outputs
@@ -167,6 +177,7 @@ class EGPRegressor(GaussianProcess):
         "coef_prior": "no_validation",
         "noise": "no_validation",
         "alpha": [Interval(Real, 0, None, closed="neither"), None],
+        "discrepancy": [StrOptions({"free", "orthogonal"})],
         "normalize_y": ["boolean"],
         "optimizer": [StrOptions({"fmin_l_bfgs_b"}), callable, None],
         "max_iter": [Interval(Integral, 0, None, closed="left")],
@@ -190,6 +201,7 @@ class EGPRegressor(GaussianProcess):
         coef_prior: CoefPrior | Literal["auto"] = "auto",
         noise: Literal["gaussian"] | Gaussian = "gaussian",
         alpha: float | None = None,
+        discrepancy: Literal["free", "orthogonal"] = "free",
         normalize_y: bool = False,
         optimizer: Callable[..., Any] | Literal["fmin_l_bfgs_b"] | None = "fmin_l_bfgs_b",
         max_iter: int = 1000,
@@ -206,6 +218,7 @@ class EGPRegressor(GaussianProcess):
         self.coef_prior = coef_prior
         self.noise = noise
         self.alpha = alpha
+        self.discrepancy = discrepancy
         self.normalize_y = normalize_y
         self.optimizer = optimizer
         self.max_iter = max_iter
@@ -261,22 +274,30 @@ class EGPRegressor(GaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             data = Dataset.from_user(self, X, y, sample_weight, relative_variance)
             problem = self._problem(data)
-            fitted = fit_exact(
-                replace(problem, max_iter=0 if self.optimizer is None else self.max_iter),
-                check_random_state(self.random_state),
-                monitor,
-                self.n_restarts,
-                self._tolerance(data.source.n_rows),
-                self.optimizer if callable(self.optimizer) else None,
-            )
-            self._set_posterior(data, problem, problem.spec, fitted)
-            if problem.vague.any():
-                self.coef_prior_scale_[problem.vague[0] if self.coef_prior_scale_.ndim == 1 else problem.vague] = np.inf
+            problem = replace(problem, max_iter=0 if self.optimizer is None else self.max_iter)
+            rng, vague = check_random_state(self.random_state), problem.vague
+
+            def fit(problem: Problem, previous: ExactFit | None, rough: bool) -> ExactFit:
+                tol = max(self._tolerance(data.source.n_rows), _ROUGH_TOL * data.source.n_rows if rough else 0.0)
+                optimizer = self.optimizer if callable(self.optimizer) else None
+                return fit_exact(problem, rng, monitor, self.n_restarts, tol, optimizer, previous)
+
+            calibration = calibrate(data, problem, fit, rng, monitor)
+            if calibration is None:
+                fitted = fit(problem, None, rough=False)
+                self._set_posterior(data, problem, problem.spec, fitted)
+            else:
+                fitted, spec = calibration.fitted, problem.spec
+                self._set_posterior(calibration.data, calibration.problem, spec, fitted, calibration)
+            if vague.any():
+                self.coef_prior_scale_[vague[0] if self.coef_prior_scale_.ndim == 1 else vague] = np.inf
             self._spec = problem.spec
             self.log_marginal_likelihood_value_ = fitted.log_marginal_likelihood
             self.loss_curve_ = fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
         self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
+        if calibration is not None:
+            calibration.warn()
         return self
 
     def _problem(self, data: Dataset) -> Problem:
@@ -305,7 +326,7 @@ class EGPRegressor(GaussianProcess):
                     "to be learned; give one of them."
                 )
             spec = spec.with_noise(self.alpha, fixed=True)
-        return replace(problem, spec=spec)
+        return replace(problem, spec=spec, orthogonal=self.discrepancy == "orthogonal")
 
     def _tolerance(self, n_rows: int) -> float:
         if isinstance(self.tol, str):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from numbers import Integral
 from typing import Any, ClassVar, Literal, Self
 
@@ -25,12 +26,13 @@ from ..fitting.messages import DEPENDENT_ROWS, interrupted
 from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem, Sharing
+from ..fitting.theta import after_more_rows, calibrate
 from ..noise import as_noise
 from ..noise.base import Noise
 from ..noise.gaussian import input_covariance, relative_noise
 from ..solvers import as_solver
 from ..solvers.base import Solver
-from ..utils.monitor import monitor_of
+from ..utils.monitor import Monitor, monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import (
     check_integer,
@@ -42,6 +44,17 @@ from ..utils.validation import (
     words_of,
 )
 from .base import GaussianProcess, names_moved_arguments
+
+# Fits with parameters of the feature map begin with so many iterations, and a tolerance of so many nats per row.
+_ROUGH_ITER, _ROUGH_TOL = 60, 1e-3
+
+
+def _fit_roughly(problem: Problem, previous: Fitted | None, rough: bool, rng: Any, monitor: Monitor) -> Fitted:
+    """Fit a problem, or find out roughly where its kernel and noise are."""
+    if rough:
+        tol = max(problem.tol or 0.0, _ROUGH_TOL * problem.source.n_rows * problem.n_outputs)
+        problem = replace(problem, noise_cv=None, max_iter=min(problem.max_iter, _ROUGH_ITER), tol=tol)
+    return fit_model(problem, rng, monitor, previous)
 
 
 class EVGPRegressor(GaussianProcess):
@@ -83,6 +96,9 @@ class EVGPRegressor(GaussianProcess):
         ``"auto"`` finds groups by short fits. See :doc:`/guide/sharing`.
     noise : {"gaussian", "student-t"}, `skevgp.noise.Gaussian` or `skevgp.noise.StudentT`, default="gaussian"
         Noise model. Use ``"student-t"`` if a few rows are outliers, and ``Gaussian(inputs=...)`` for noise in X.
+    discrepancy : {"free", "orthogonal"}, default="free"
+        Whether f may imitate the features. If ``"orthogonal"``, f is orthogonal to them on the rows of X, so that
+        ``coef_`` is the best fit of the features to the noise-free g(x) in least squares. See :doc:`/guide/parameters`.
     noise_cv : int, default=5
         Number of folds that calibrate signal and noise variance after the iterations. Folds are whole ``groups`` of
         `fit`, or random rows. If None, or with fewer than 50 rows, there is no calibration. See :doc:`/guide/noise`.
@@ -118,6 +134,11 @@ class EVGPRegressor(GaussianProcess):
         Prior means and standard deviations of the weights. The latter are learned (see `CoefPrior`).
     coef_groups_ : ndarray of str of the shape of ``coef_``
         Label of the group of each weight, or empty if its prior standard deviation is not learned.
+    theta_, theta_std_ : dict of str to float
+        Posterior medians and standard deviations of the parameters of the feature map. Only if it has any, such as
+        `skevgp.features.ParametricFeatures`.
+    theta_cov_ : ndarray of shape (n_theta, n_theta)
+        Posterior covariance of the parameters, in the order of ``theta_``.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     inducing_points_ : ndarray of shape (m, d) or, for several outputs unless all share them, (n_outputs, m, d)
@@ -208,6 +229,7 @@ class EVGPRegressor(GaussianProcess):
         "inducing_init": [StrOptions({"auto", "k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none", "auto"}), "array-like"],
         "noise": "no_validation",
+        "discrepancy": [StrOptions({"free", "orthogonal"})],
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "normalize_y": ["boolean"],
         "solver": "no_validation",
@@ -232,6 +254,7 @@ class EVGPRegressor(GaussianProcess):
         inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Sharing = "auto",
         noise: str | Noise = "gaussian",
+        discrepancy: Literal["free", "orthogonal"] = "free",
         noise_cv: int | None = 5,
         normalize_y: bool = False,
         solver: str | Solver = "lbfgs",
@@ -249,6 +272,7 @@ class EVGPRegressor(GaussianProcess):
         self.inducing_init = inducing_init
         self.sharing = sharing
         self.noise = noise
+        self.discrepancy = discrepancy
         self.noise_cv = noise_cv
         self.normalize_y = normalize_y
         self.solver = solver
@@ -330,7 +354,11 @@ class EVGPRegressor(GaussianProcess):
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
             numbers = None if noise.inputs is None else self._numbers(data)
-            fitted = fit_model(problem, rng, monitor, previous)
+            calibration = calibrate(data, problem, partial(_fit_roughly, rng=rng, monitor=monitor), rng, monitor)
+            if calibration is not None:
+                data, problem, fitted = calibration.data, calibration.problem, calibration.fitted
+            else:
+                fitted = fit_model(problem, rng, monitor, previous)
             if numbers is not None and noise.inputs is not None:
 
                 def refit(variance: np.ndarray, before: Fitted) -> Fitted:
@@ -341,9 +369,11 @@ class EVGPRegressor(GaussianProcess):
                 fitted = fit_to_noisy_inputs(
                     fitted, data, posterior_of, numbers, covariance, refit, monitor, self._columns_changed
                 )
-            self._set_posterior(data, problem, problem.spec, fitted)
+            self._set_posterior(data, problem, problem.spec, fitted, calibration)
             self._set_attributes(fitted, data)
         self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
+        if calibration is not None:
+            calibration.warn()
         if fitted.dependent:
             warn_user(DEPENDENT_ROWS, DependentRowsWarning)
         return self
@@ -412,6 +442,8 @@ class EVGPRegressor(GaussianProcess):
                 by_inputs, _ = look_at_slopes(self._posterior, data, numbers, covariance, self._columns_changed)
                 noisier = relative_noise(by_inputs, self._posterior.predictor.noise, data.chosen)
             self._fitted = fitted.updated(data.source, fading, noisier)
+            if self._theta is not None:
+                self._theta, self._fitted = after_more_rows(self._theta, maps.feature_map, self._fitted)
             self._posterior = replace(self._posterior, predictor=self._fitted.predictor())
             self._set_weights_and_noise()
             self._set_weights_of_rows(data)
@@ -457,6 +489,7 @@ class EVGPRegressor(GaussianProcess):
             sharing=self.sharing,
             family=solver.posterior,
             tight=solver.bound == "tight",
+            orthogonal=self.discrepancy == "orthogonal",
             placement=Placement.of(self.inducing_init, self.n_inducing, most, problem.n_columns),
             solver=solver,
             max_iter=solver.default_max_iter if self.max_iter is None else self.max_iter,

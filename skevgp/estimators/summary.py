@@ -13,6 +13,7 @@ from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import ConstantKernel, Product
 
 from ..fitting.prior import coef_names
+from ..fitting.theta import ThetaPosterior
 from ..utils.optional import require
 
 # Inputs of the Gaussian process of a joint's torque.
@@ -30,12 +31,17 @@ class Parameter(NamedTuple):
     """A learned number."""
 
     output: int | str | None  # None if it belongs to all outputs
-    part: str  # "weight", "signal std", "noise std", or a hyperparameter such as "length_scale"
+    part: str  # "weight", "parameter" of the feature map, "signal std", "noise std", or a name such as "length_scale"
     name: str  # of the feature, or of the column of the kernel
     value: float
     std: float = np.nan  # posterior standard deviation of weights
     prior_mean: float = np.nan  # of weights
     prior_std: float = np.nan  # of weights
+    # Ends of the 95 % credible interval, and of that of the prior. Only of parameters of the feature map.
+    low: float = np.nan
+    high: float = np.nan
+    prior_low: float = np.nan
+    prior_high: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -117,9 +123,11 @@ class ModelSummary:
                 labels = [name, *[""] * (len(wrapped) - 1)]
                 lines += [f"{label:{width}}{line}" for label, line in zip(labels, wrapped, strict=True)]
             parts.append("\n".join(lines))
-        # The name of a column may contain a line end.
-        table = [[" ".join(cell.split()) for cell in line] for line in self._weights()]
-        if len(table) > 1:
+        for rows in (self._of_feature_map(), self._weights()):
+            # The name of a column may contain a line end.
+            table = [[" ".join(cell.split()) for cell in row] for row in rows]
+            if len(table) == 1:
+                continue
             shown = table[: _LINES + 1]
             widths = [max(len(line[column]) for line in shown) for column in range(len(table[0]))]
             lines = [
@@ -137,22 +145,32 @@ class ModelSummary:
         for output, facts in self._facts():
             parts.append("" if output is None else f"<p>output <b>{escape(str(output))}</b></p>")
             parts.append(html_table(list(facts.items())))
-        table = list(self._weights())
-        if len(table) > 1:
+        for table in (list(self._of_feature_map()), list(self._weights())):
+            if len(table) == 1:
+                continue
             parts.append(f"<div {_SCROLLED}>{html_table(table[1:], table[0])}</div>")
         return f'<div style="font-size: 0.9em">{"".join(parts)}</div>'
 
     def _facts(self) -> Iterator[tuple[int | str | None, dict[str, str]]]:
         """Yield each output with its numbers other than weights: name -> text."""
-        outputs = [*self.kernels, *(one.output for one in self.parameters if one.part != "weight")]
+        others = [one for one in self.parameters if one.part not in ("weight", "parameter")]
+        outputs = [*self.kernels, *(one.output for one in others)]
         for output in dict.fromkeys(outputs):
             facts = {"kernel": self.kernels[output]} if output in self.kernels else {}
-            for one in self.parameters:
-                if one.part != "weight" and one.output == output:
+            for one in others:
+                if one.output == output:
                     said = _plus_minus(one.value, one.std)
                     text = f"{one.name} {said}" if one.name else said
                     facts[one.part] = f"{facts[one.part]}, {text}" if one.part in facts else text
             yield output, facts
+
+    def _of_feature_map(self) -> Iterator[tuple[str, ...]]:
+        """Yield the rows of the table of θ, the header first."""
+        yield "parameter", "prior", "posterior", "95 % interval"
+        for one in self.parameters:
+            if one.part == "parameter":
+                prior, interval = f"{one.prior_low:.4g} to {one.prior_high:.4g}", f"{one.low:.4g} to {one.high:.4g}"
+                yield one.name, prior, _plus_minus(one.value, one.std), interval
 
     def _weights(self) -> Iterator[tuple[str, ...]]:
         """Yield the rows of the table of β, the header first."""
@@ -184,6 +202,8 @@ def of_gaussian_process(model: Any) -> ModelSummary:
     for (output, kernel), variance in zip(kernels.items(), noise, strict=True):
         numbers += _of_kernel(kernel, output, columns)
         numbers.append(Parameter(output, "noise std", "", float(np.sqrt(variance))))
+    if model._theta is not None:
+        numbers += _of_theta(model._theta)
     if hasattr(model, "coef_"):
         outputs = list(range(len(model.coef_))) if model.coef_.ndim == 2 else [None]
         numbers += _of_weights(model, outputs)
@@ -228,6 +248,17 @@ def of_inverse_dynamics(model: Any, joints: Sequence[str]) -> ModelSummary:
         kernels,
         (*numbers, *_of_weights(model, [None])),
     )
+
+
+def _of_theta(posterior: ThetaPosterior) -> Iterator[Parameter]:
+    values, std, _ = posterior.attributes()
+    q, intervals = len(values), posterior.intervals()
+    before = ThetaPosterior(posterior.theta, np.zeros(q), np.eye(q)).intervals()
+    for name, unit in zip(values, posterior.theta.units, strict=True):
+        label = f"{name} [{unit}]" if unit else name
+        yield Parameter(
+            None, "parameter", label, values[name], std[name], np.nan, np.nan, *intervals[name], *before[name]
+        )
 
 
 def _of_weights(model: Any, outputs: Sequence[int | None]) -> Iterator[Parameter]:

@@ -4,13 +4,19 @@ from .angles import AngleEncoder
 from .gravity import LinkGravity
 from .newton import InertiaForce, InertiaForceGravity
 from .nominal import NominalDynamics
+from .parametric import ParametricFeatures
 from .rigid_body import RigidBodyRegressor
+from .theta import LogNormal, Normal, Uniform
 
 __all__ = [
     "AngleEncoder",
     "InertiaForce",
     "InertiaForceGravity",
     "LinkGravity",
+    "LogNormal",
     "NominalDynamics",
+    "Normal",
+    "ParametricFeatures",
     "RigidBodyRegressor",
+    "Uniform",
 ]

@@ -10,9 +10,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..data.blocks import Blocks
+from ..data.rows import LocalSource, RawRows, Rows, Source
 from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values, log_prior
 from ..model.predictor import CoefficientPrior, Predictor
+from ..model.weights import WeightLikelihood
 from ..solvers import LBFGS
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
@@ -56,11 +60,13 @@ class ExactTask:
     optimizer: Optimizer | None = None
     units: Units | None = None
 
-    # Only sparse models have samples, inducing points, and an earlier fit.
+    # First values from another fit.
+    warm: Values | None = None
+
+    # Only sparse models have samples and inducing points.
     interpolates: ClassVar[bool] = True
     samples: ClassVar[tuple[int, ...]] = ()
-    warm: ClassVar[None] = None
-    placed: ClassVar[bool] = False
+    placed: ClassVar[bool] = True
     place: ClassVar[None] = None
 
     @property
@@ -208,10 +214,58 @@ class ExactFit:
     fit: Fit
     # For the user.
     messages: tuple[str, ...]
+    # Whether f is orthogonal to the features (see `model.bounds.Group.leaks`).
+    orthogonal: bool = False
 
     def predictor(self) -> Predictor:
         """The predictor of all outputs, in the user's units."""
-        return self.units.predictor([self.model.predictor(self.fit.values)], [list(range(len(self.units.target_unit)))])
+        if self.orthogonal:
+            sparse, values, blocks = self._sparse_twin()
+            found = sparse.at_optimum(values, sparse.statistics(values, blocks), blocks=blocks)
+        else:
+            found = self.model.predictor(self.fit.values)
+        return self.units.predictor([found], [list(range(len(self.units.target_unit)))])
+
+    # --- other features of the same rows (see `fitting.theta`) --------------------------------------------------------
+
+    def moved(self, source: Source, prior: CoefficientPrior) -> ExactFit:
+        """The same kernel and noise with other features, and a prior with learned scales for these."""
+        units = self._with_prior(prior)
+        rows = units.rows(source)
+        vague = np.zeros(prior.scale.shape, dtype=bool)
+        vague[:, : self.model.vague.shape[1]] = self.model.vague
+        model = replace(self.model, prior=units.internal_prior(), vague=vague, rows=rows.some(np.arange(len(rows))))
+        values = self.fit.values
+        bound = float(model.log_likelihoods(values).sum()) + log_prior(values)
+        return replace(self, units=units, model=model, fit=replace(self.fit, bound=bound))
+
+    def weight_likelihoods(self, source: Source, prior: CoefficientPrior) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, for other features, in the user's units."""
+        moved = self.moved(source, prior)
+        sparse, values, blocks = moved._sparse_twin()
+        each = sparse.weight_likelihoods(values, sparse.statistics(values, blocks))
+        return [own.in_units(unit) for own, unit in zip(each, self.units.target_unit, strict=True)]
+
+    def _with_prior(self, prior: CoefficientPrior) -> Units:
+        factors = self.fit.values.get("coef_factors")
+        return replace(self.units, prior=prior if factors is None else prior.at({"coef_factors": 1.0 / factors}))
+
+    def _sparse_twin(self) -> tuple[SparseModel, Values, Blocks]:
+        """The sparse model whose inducing points are the rows, its values, and its rows."""
+        model, o = self.model, len(self.units.target_unit)
+        groups = tuple(slice(i, i + 1) for i in range(o)) if model.kernels is not None else (slice(0, o),)
+        sparse = SparseModel(
+            model.kernel, model.prior, "full", groups, complete=True, kernels=model.kernels, orthogonal=self.orthogonal
+        )
+        points = np.array([model.rows.of(group).inputs for group in groups])
+        rows = Rows(LocalSource.holding(model.rows), _as_it_is)
+        values = self.fit.values | {"inducing_points": points}
+        return sparse, values, sparse.blocks(rows, points.shape[1])
+
+    @property
+    def lower_bound(self) -> float:
+        """Log marginal likelihood, in nats, summed over outputs."""
+        return self.log_marginal_likelihood
 
     @property
     def prior(self) -> CoefficientPrior:
@@ -267,8 +321,9 @@ def fit_exact(
     n_restarts: int,
     tol: float,
     optimizer: Optimizer | None = None,
+    previous: ExactFit | None = None,
 ) -> ExactFit:
-    """Maximise the log marginal likelihood of all rows of a problem."""
+    """Maximise the log marginal likelihood of all rows of a problem, from the end of another fit if it is given."""
     units, rows, vague = problem.units, problem.units.rows(problem.source), problem.vague
     n, first, variance = len(rows), problem.spec.starts.hyperparameters.value, 1.0
     everything = rows.some(np.arange(n))
@@ -294,6 +349,7 @@ def fit_exact(
         n_restarts,
         optimizer,
         units,
+        None if previous is None else table.started_at(_values_in(units, previous)).values_at_start(),
     )
     best = search(task)
     values, changed = with_signal_of_constants(problem, rows, table, best.values)
@@ -316,7 +372,17 @@ def fit_exact(
     message = " ".join(part for part in messages if part)
     if monitor.stopped:
         message = interrupted(best.n_iter, monitor.max_time if monitor.out_of_time else None)
-    return ExactFit(units, model, table, best, (message,) if message else ())
+    return ExactFit(units, model, table, best, (message,) if message else (), problem.orthogonal)
+
+
+def _as_it_is(raw: RawRows) -> RawRows:
+    return raw
+
+
+def _values_in(units: Units, fitted: ExactFit) -> Values:
+    """The values of a fit in other internal units."""
+    ratio = (fitted.units.target_unit / units.target_unit) ** 2
+    return {name: value * ratio if name in ("signal", "noise") else value for name, value in fitted.fit.values.items()}
 
 
 def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:

@@ -13,11 +13,12 @@ from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values, log_prior
 from ..model.predictor import CoefficientPrior, Predictor
 from ..model.statistics import Kernel, SufficientStatistics
+from ..model.weights import WeightLikelihood
 from ..utils.monitor import Monitor
 from .calibration import calibrated
 from .exact import exact_model_of_sample
 from .messages import far_from_prior, interrupted, signal_gone
-from .model import Model, models_of, parts_of
+from .model import Model, exact_twin, models_of, parts_of
 from .outliers import RowDoubts, fit_doubting
 from .problem import Problem
 from .search import Fit, Rules, Start, better, search
@@ -145,9 +146,11 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     # In the sparse predictor, the jitter of k(X_m, X_m) would show in the std.
     distinct = values["inducing_points"].shape[1] == len(model.rows)
     is_exact = exact is not None and (distinct or bool((values["signal"] > _HIGH_RATIO * values["noise"]).any()))
+    # An f that is orthogonal to the features is not that of the fit's own predictors.
+    is_exact = is_exact and not sparse.orthogonal
     if exact is not None and is_exact:
         predictor = exact.predictor(values)
-    elif found is None and not changed and fit.predictor is not None:
+    elif found is None and not changed and fit.predictor is not None and not sparse.orthogonal:
         predictor = fit.predictor
     else:
         predictor = sparse.at_optimum(values, statistics, blocks=model.blocks)
@@ -206,6 +209,27 @@ class FittedModel:
         if self.known_upper_bound is not None:
             return self.known_upper_bound
         return self.sparse.upper_bound(self.values, self.statistics)
+
+    def moved(self, rows: Rows, prior: CoefficientPrior) -> FittedModel:
+        """The model of the same rows with other features, at the same values."""
+        sparse = replace(self.sparse, prior=prior)
+        blocks = sparse.blocks(rows, self.values["inducing_points"].shape[1])
+        statistics = sparse.statistics(self.values, blocks)
+        if self.is_exact:
+            exact = exact_twin(sparse, self.table, rows)
+            bound, predictor = float(exact.log_likelihoods(self.values).sum()), exact.predictor(self.values)
+        else:
+            bound = sparse.bound(self.values, statistics, blocks)
+            predictor = sparse.at_optimum(self.values, statistics, blocks=blocks)
+        upper = bound if self.is_exact else sparse.upper_bound(self.values, statistics, blocks)
+        return replace(
+            self,
+            sparse=sparse,
+            statistics=statistics,
+            predictor=predictor,
+            known_bound=bound,
+            known_upper_bound=upper,
+        )
 
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
         """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.
@@ -266,14 +290,60 @@ class Fitted:
         models = (one.updated(rows.outputs(own).noisier(row_variance), weight) for own, one in pairs)
         return replace(self, models=tuple(models))
 
+    # --- other features of the same rows (see `fitting.theta`) --------------------------------------------------------
+
+    def moved(self, source: Source, prior: CoefficientPrior) -> Fitted:
+        """The models with the same kernel and noise, other features, and a prior with learned scales for these."""
+        units = self._with_prior(prior)
+        rows, internal = units.rows(source), units.internal_prior()
+        pairs = zip(self.outputs, self.models, strict=True)
+        models = (one.moved(rows.outputs(own), internal.outputs(own)) for own, one in pairs)
+        return replace(self, units=units, models=tuple(models))
+
+    def reweighted(self, prior: CoefficientPrior) -> Fitted:
+        """The models with another prior of the weights that has the same offset."""
+        units = self._with_prior(prior)
+        internal, models = units.internal_prior(), []
+        for own, one in zip(self.outputs, self.models, strict=True):
+            sparse = replace(one.sparse, prior=internal.outputs(own))
+            predictor = sparse.at_optimum(one.values, one.statistics)
+            models.append(replace(one, sparse=sparse, predictor=predictor, known_bound=None, known_upper_bound=None))
+        return replace(self, units=units, models=tuple(models))
+
+    def weight_likelihoods(
+        self, source: Source | None = None, prior: CoefficientPrior | None = None
+    ) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, in the user's units.
+
+        With a ``source``, they are those of other features, which have the prior ``prior`` with learned scales.
+        """
+        units = self.units if prior is None else self._with_prior(prior)
+        rows, internal = None if source is None else units.rows(source), units.internal_prior()
+        found: dict[int, WeightLikelihood] = {}
+        for own, one in zip(self.outputs, self.models, strict=True):
+            sparse, statistics = replace(one.sparse, prior=internal.outputs(own)), one.statistics
+            if rows is not None:
+                blocks = sparse.blocks(rows.outputs(own), one.values["inducing_points"].shape[1])
+                statistics = sparse.statistics(one.values, blocks)
+            each = sparse.weight_likelihoods(one.values, statistics)
+            found |= {o: each[i].in_units(units.target_unit[o]) for i, o in enumerate(own)}
+        return [found[o] for o in sorted(found)]
+
+    def _with_prior(self, prior: CoefficientPrior) -> Units:
+        """The units with a prior that has the learned scales."""
+        factors = self._factors()
+        return replace(self.units, prior=prior.at({"coef_factors": 1.0 / factors}) if factors.size else prior)
+
+    def _factors(self) -> np.ndarray:
+        factors = np.ones((len(self.units.target_unit), self.units.prior.n_groups))
+        for outputs, one in zip(self.outputs, self.models, strict=True):
+            factors[outputs] = one.values.get("coef_factors", 1.0)
+        return factors
+
     @property
     def prior(self) -> CoefficientPrior:
         """The prior of the weights in the user's units, with the learned scales."""
-        prior, o = self.units.prior, len(self.units.target_unit)
-        factors = np.ones((o, prior.n_groups))
-        for outputs, one in zip(self.outputs, self.models, strict=True):
-            factors[outputs] = one.values.get("coef_factors", 1.0)
-        return prior.at({"coef_factors": factors})
+        return self.units.prior.at({"coef_factors": self._factors()})
 
     @property
     def row_scales(self) -> np.ndarray | None:

@@ -44,6 +44,15 @@ _BOUND_ROUNDING = 1e-8
 _NATURAL_RATES = 0.3, 0.02
 
 
+def exact_twin(sparse: SparseModel, table: ParameterTable, rows: Rows) -> ExactModel:
+    """The exact model of the same rows as a sparse model."""
+    kernels, no_vague = None, np.zeros(sparse.prior.scale.shape, dtype=bool)
+    if sparse.kernels is not None:
+        sets = [sparse.set_of(o, table["inducing_points"]) for o in range(len(sparse.prior.scale))]
+        kernels = tuple(sparse.kernels[group] for group in sets)
+    return ExactModel(sparse.kernel, sparse.prior, no_vague, rows.some(np.arange(len(rows))), kernels)
+
+
 class Part(NamedTuple):
     """Outputs that are fitted together."""
 
@@ -164,6 +173,7 @@ def models_of(
                     stay,
                     own_kernels if part.split else None,
                     problem.tight,
+                    problem.orthogonal,
                 ),
                 own_rows.noisier(problem.row_variance),
                 table,
@@ -249,11 +259,7 @@ class Model:
         sparse, separate = self.sparse, self.table["hyperparameters"].start.ndim == 2
         if not sparse.complete or separate or self.problem.noise.heavy_tails or self.rules.lowest_noise_exact is None:
             return None
-        rows, kernels = self.rows.some(np.arange(len(self.rows))), None
-        if sparse.kernels is not None:
-            sets = [sparse.set_of(o, self.table["inducing_points"]) for o in range(len(sparse.prior.scale))]
-            kernels = tuple(sparse.kernels[group] for group in sets)
-        return ExactModel(sparse.kernel, sparse.prior, np.zeros(sparse.prior.scale.shape, dtype=bool), rows, kernels)
+        return exact_twin(sparse, self.table, self.rows)
 
     def objective(self, table: ParameterTable, n_rows: int | None = None) -> BoundObjective | LikelihoodObjective:
         """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all."""

@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 
-from ..data.maps import transformed
+from ..maps.theta import parts_of_union, steps_of
 from ..utils.sklearn import safe_indexing
 from ..utils.state import StatefulEstimator
 from ..utils.validation import as_floats, check_magnitude
@@ -352,15 +352,16 @@ def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") ->
     if any(hasattr(feature_map, method) for method in ("coef_prior", "coef_scale", "coef_groups")):
         yield _Part(feature_map, columns, 1.0, name)
     elif isinstance(feature_map, Pipeline):
-        steps = [step for _, step in feature_map.steps if step not in ("passthrough", None)]
+        steps = steps_of(feature_map)
         for step in steps[:-1]:
             first = step.transform(first)
         if steps:
             yield from _parts(steps[-1], first, columns, name)
     else:
-        for own_name, part, part_first, own, weight in _parts_of(feature_map, first):
-            for inner in _parts(part, part_first, columns[own], f"{name}: {own_name}" if name else own_name):
-                yield inner._replace(weight=weight * inner.weight)
+        for part in parts_of_union(feature_map, first):
+            own_name = f"{name}: {part.name}" if name else part.name
+            for inner in _parts(part.transformer, part.rows, columns[part.columns], own_name):
+                yield inner._replace(weight=part.weight * inner.weight)
 
 
 def says_shared(feature_map: Any) -> bool:
@@ -368,7 +369,7 @@ def says_shared(feature_map: Any) -> bool:
     if hasattr(feature_map, "share_coef"):
         return bool(feature_map.share_coef)
     if isinstance(feature_map, Pipeline):
-        parts = [step for _, step in feature_map.steps if step not in ("passthrough", None)][-1:]
+        parts = steps_of(feature_map)[-1:]
     elif isinstance(feature_map, FeatureUnion):
         parts = [part for _, part in feature_map.transformer_list if part != "drop"]
     elif isinstance(feature_map, ColumnTransformer):
@@ -396,34 +397,6 @@ def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tupl
         scale, correlation = _of_covariance(parts[1], f"The covariance of {called}", shape)
         return mean, scale, correlation
     return mean, parts[1].reshape(shape), _independent(shape)
-
-
-def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[str, Any, Any, np.ndarray, float]]:
-    """The parts of a union: name, map, its input for the first row, its columns in the result, and its weight.
-
-    Parts of weight 0 are left out: their features are 0.
-    """
-    if isinstance(feature_map, FeatureUnion):
-        start = 0
-        for name, part in feature_map.transformer_list:
-            if part == "drop":
-                continue
-            width = np.shape(first if part == "passthrough" else transformed(part, first))[-1]
-            weight = _weight(feature_map, name)
-            if weight != 0.0:
-                yield name, part, first, np.arange(start, start + width), weight
-            start += width
-    elif isinstance(feature_map, ColumnTransformer):
-        for name, part, columns in feature_map.transformers_:
-            own = np.arange(feature_map.output_indices_[name].start, feature_map.output_indices_[name].stop)
-            weight = _weight(feature_map, name)
-            if len(own) and weight != 0.0:
-                yield name, part, safe_indexing(first, columns, axis=1), own, weight
-
-
-def _weight(union: Any, name: str) -> float:
-    weight = (union.transformer_weights or {}).get(name)
-    return 1.0 if weight is None else float(weight)
 
 
 def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int, letter: str = "h") -> np.ndarray:

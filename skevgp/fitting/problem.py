@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -70,6 +70,8 @@ class Problem:
     # (n, o): noise variances of the rows in units of σ², on top of those in the source. The outputs of a model share
     # their mean.
     row_variance: np.ndarray | None = None
+    # Whether f is orthogonal to the features (see `model.bounds.Group.leaks`).
+    orthogonal: bool = False
     # For independent models, or else for blocks of rows.
     n_threads: int = 1
 
@@ -124,6 +126,15 @@ class Problem:
         shapes = inputs.mean.shape, features.mean.shape
         return cls(data.source, units, spec, vague, shapes, data.groups, noise=noise)
 
+    def with_features(self, data: Dataset, prior: CoefficientPrior) -> Problem:
+        """The same problem with other features of the same rows. ``prior`` is that of their weights."""
+        inputs, features, targets = data.source.sum(moments_of_rows)
+        units = Units.of(data.source, features, targets, self.units.target_mean, prior)
+        vague = np.zeros(prior.scale.shape, dtype=bool)
+        vague[:, : self.vague.shape[1]] = self.vague
+        shapes = inputs.mean.shape, features.mean.shape
+        return replace(self, source=data.source, units=units, vague=vague, shapes=shapes)
+
     @property
     def n_outputs(self) -> int:
         """Number of outputs."""
@@ -150,6 +161,11 @@ class Problem:
         if solver.stochastic and self.per_output and isinstance(self.sharing, str) and self.sharing == "kernel":
             raise ValueError(
                 'sharing="kernel" of outputs with rows of their own needs solver="lbfgs" or an LBFGS(...); got '
+                f"solver={solver!r}."
+            )
+        if self.orthogonal and (solver.stochastic or self.family == "diagonal"):
+            raise ValueError(
+                'discrepancy="orthogonal" needs solver="lbfgs" or an LBFGS(...) with posterior="full"; got '
                 f"solver={solver!r}."
             )
         told = "shared=True of CoefPrior" if prior.shared else "a covariance of the weights (cov of CoefPrior)"

@@ -20,7 +20,14 @@ from typing import Literal
 import numpy as np
 
 from ..data.blocks import Blocks, LinearSums
-from ..utils.linalg import diagonal_of, jittered_cholesky, symmetric_inverse, times_lower, triangular_inverse
+from ..utils.linalg import (
+    diagonal_of,
+    jittered_cholesky,
+    semidefinite_inverse,
+    symmetric_inverse,
+    times_lower,
+    triangular_inverse,
+)
 from .predictor import CoefficientPrior
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
@@ -47,6 +54,8 @@ class Group:
     complete: bool = False
     # Whether the bound is the tight one. ``statistics`` then have the charge at ``signal`` and ``noise``.
     tight: bool = False
+    # Whether f is orthogonal to the features, summed over the rows of the statistics.
+    orthogonal: bool = False
 
     def charges(self) -> np.ndarray:
         """Twice the nats (o,) that the bound loses for what the points do not explain, and their slopes in log s²."""
@@ -63,18 +72,48 @@ class Group:
         return scales
 
     def times_T(self, index: int, A: np.ndarray, transposed: bool = False) -> np.ndarray:
-        """T A, or Tᵀ A, of an output, for A (m + p,) or (m + p, k). T = blockdiag(s I, C), so that P = [Vᵀ, H] T."""
+        """T A, or Tᵀ A, of an output, for A (m + p,) or (m + p, k). P = [Vᵀ, H] T.
+
+        T = blockdiag(s I, C), or this times [I, 0; -leak, I] if f is orthogonal to the features.
+        """
+        m = len(self.statistics.VV)
+        if self.orthogonal and not transposed:
+            A = A.copy()
+            A[m:] -= self.leaks[index] @ A[:m]
         found = (self.scales[index] * A.T).T
         if self.prior.root is not None:
-            C, m = self.prior.root[index], len(self.statistics.VV)
+            C = self.prior.root[index]
             found[m:] = (C.T if transposed else C) @ A[m:]
+        if self.orthogonal and transposed:
+            found[:m] -= self.leaks[index].T @ found[m:]
         return found
+
+    # A discrepancy f that is orthogonal to the features has the kernel k⊥ = k - k_h G⁻¹ k_hᵀ of Plumlee (2017), here
+    # with sums over the rows: f⊥ = f - A (AᵀA)⁺ Aᵀ f(X) on the rows, A = H C. With f = s Vᵀ v, f⊥ is the same function
+    # minus A leak v, leak = (AᵀA)⁺ Aᵀ Vᵀ s (p, m). So f⊥ and the weights w⊥ of the best fit in least squares are a
+    # change of coordinates: f⊥ + A w⊥ = f + A (w⊥ - leak v).
+
+    @cached_property
+    def leaks(self) -> list[np.ndarray]:
+        """The matrix (p, m) of each output that maps v to the weights of the best fit of f by the features."""
+        statistics, found = self.statistics, []
+        for output, signal in enumerate(self.signal):
+            C = self.prior.roots()[output]
+            AA, AV = C.T @ statistics.HH @ C, C.T @ statistics.VH.T
+            found.append(np.sqrt(signal) * (semidefinite_inverse(AA) @ AV))
+        return found
+
+    def orthogonalised(self, index: int, crossed: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """V⊥ V⊥ᵀ (m, m) and V⊥ [H, r] of an output, from V [H, r] and Hᵀ [H, r], where V⊥ has no part along A."""
+        C, s = self.prior.roots()[index], np.sqrt(self.signal[index])
+        leak, VA = self.leaks[index] / s, self.statistics.VH @ C
+        return self.statistics.VV - VA @ leak, crossed - leak.T @ (C.T @ linear)
 
     def products(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """PᵀP (m + p, m + p) and Pᵀr (m + p,) of an output."""
         statistics, scales = self.statistics, self.scales[index]
         sums = np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
-        if self.prior.root is not None:
+        if self.prior.root is not None or self.orthogonal:
             # Tᵀ (Tᵀ J)ᵀ = Tᵀ J T, with J = [V; Hᵀ] [Vᵀ, H].
             TJ = self.times_T(index, statistics.joint, transposed=True)
             return self.times_T(index, TJ.T, transposed=True), self.times_T(index, sums, transposed=True)

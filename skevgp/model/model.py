@@ -24,6 +24,7 @@ from .bounds import (
 from .parameters import Parameter, Values
 from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect, errors
+from .weights import WeightLikelihood, weight_likelihoods
 
 # Means are refined only if the rounding error of B, in directions in which B is about 1, is below this.
 _REFINABLE = 0.1
@@ -52,6 +53,9 @@ class SparseModel:
     kernels: tuple[Kernel, ...] | None = None
     # Whether the bound is the tight one of Titsias (2025), not that of Titsias (2009).
     tight: bool = False
+    # Whether the posterior is that of an f which is orthogonal to the features (see `bounds.Group.leaks`). Bounds and
+    # their gradients are those of the free f.
+    orthogonal: bool = False
 
     def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
         """k̃ of a group, and its hyperparameters (n_hyper,)."""
@@ -150,12 +154,21 @@ class SparseModel:
         If ``blocks`` of all rows are given, means are refined, unless outputs share their weights.
         """
         groups, mean, root = self.groups_of(values, statistics, whitenings), [], []
+        leaks: list[np.ndarray] | None = None
+        if self.orthogonal:
+            groups = [replace(group, orthogonal=True) for group in groups]
+            leaks = [leak for group in groups for leak in group.leaks]
         for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
             L_inv = group.whitening.L_inv
             for q in posteriors if blocks is None or self.prior.shared else _refined(group, posteriors, blocks):
                 mean.append(q.mean)
                 root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
-        return self.predictor(values, [group.whitening for group in groups], mean, root)
+        return self.predictor(values, [group.whitening for group in groups], mean, root, leaks)
+
+    def weight_likelihoods(self, values: Values, statistics: Sequence[SufficientStatistics]) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, with f integrated out."""
+        groups = self.groups_of(values, statistics)
+        return [own for group in groups for own in weight_likelihoods(replace(group, orthogonal=self.orthogonal))]
 
     def predictor(
         self,
@@ -163,8 +176,12 @@ class SparseModel:
         whitenings: Sequence[Whitening],
         mean: Sequence[np.ndarray],
         root: Sequence[np.ndarray],
+        leaks: Sequence[np.ndarray] | None = None,
     ) -> Predictor:
-        """The predictor for q(ω) of each output with the given mean (m + p,) and covariance rootᵀ root."""
+        """The predictor for q(ω) of each output with the given mean (m + p,) and covariance rootᵀ root.
+
+        ``leaks`` (p, m) are given if f is orthogonal to the features.
+        """
         groups = [
             PredictorGroup.of(
                 outputs,
@@ -175,6 +192,7 @@ class SparseModel:
                 self.prior.at(values).outputs(outputs),
                 mean[outputs],
                 root[outputs],
+                None if leaks is None else leaks[outputs],
             )
             for index, (outputs, points, whitening) in enumerate(
                 zip(self.groups, values["inducing_points"], whitenings, strict=True)

@@ -114,6 +114,9 @@ class PredictorGroup:
     mean: np.ndarray
     # (o, k, m + p), where k is m + p, or less in the exact model. The last p of the k rows belong to the weights.
     root: np.ndarray
+    # (o, p, m): if f is orthogonal to the features, the weights of the best fit are those of ``mean`` and ``root`` plus
+    # this times the numbers of f. None: they are those of ``mean`` and ``root``.
+    leak: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -127,16 +130,26 @@ class PredictorGroup:
         prior: CoefficientPrior,
         mean: Sequence[np.ndarray],
         root: Sequence[np.ndarray],
+        leaks: Sequence[np.ndarray] | None = None,
     ) -> PredictorGroup:
-        """The group for q(ω) of each output, with ω = (v, w) as in `bounds`: mean (m + p,) and root (k, m + p)."""
+        """The group for q(ω) of each output, with ω = (v, w) as in `bounds`: mean (m + p,) and root (k, m + p).
+
+        With ``leaks`` (p, m), ω = (v, w⊥) of `bounds.Group.leaks`.
+        """
         m, s = len(points), np.sqrt(signal)[:, np.newaxis]
         # mean Tᵀ and root Tᵀ, with T = blockdiag(s I, C) of each output (see `bounds.Group.times_T`).
-        own_mean, own_root = np.array(mean), np.array(root)
+        own_mean, own_root, leak = np.array(mean), np.array(root), None
+        if leaks is not None:
+            # w = w⊥ - leak v, and in the predictor's coordinates β⊥ = β + (C leak / s) (s v).
+            each = np.array(leaks)
+            own_mean[:, m:] -= np.einsum("opm,om->op", each, own_mean[:, :m])
+            own_root[:, :, m:] -= np.einsum("okm,opm->okp", own_root[:, :, :m], each)
+            leak = prior.roots() @ each / s[:, np.newaxis]
         own_mean[:, :m] *= s
         own_mean[:, m:] = prior.times(own_mean[:, m:])
         own_root[:, :, :m] *= s[:, np.newaxis]
         own_root[:, :, m:] = own_root[:, :, m:] @ prior.roots().transpose(0, 2, 1)
-        return cls(outputs, kernel, hyperparameters, points, whitening, signal, own_mean, own_root)
+        return cls(outputs, kernel, hyperparameters, points, whitening, signal, own_mean, own_root, leak)
 
 
 class Projected(NamedTuple):
@@ -343,8 +356,11 @@ class Predictor:
         covariance = np.empty((o, p, p))
         for group in self.groups:
             m = len(group.points)
-            mean[group.outputs] += group.mean[:, m:]
-            deviation = group.root[:, :, m:]
+            own, deviation = group.mean[:, m:], group.root[:, :, m:]
+            if group.leak is not None:
+                own = own + np.einsum("opm,om->op", group.leak, group.mean[:, :m])
+                deviation = deviation + np.einsum("okm,opm->okp", group.root[:, :, :m], group.leak)
+            mean[group.outputs] += own
             covariance[group.outputs] = deviation.transpose(0, 2, 1) @ deviation
         return mean, covariance
 

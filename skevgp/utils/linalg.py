@@ -10,6 +10,8 @@ from scipy.linalg import blas, eigh, lapack
 
 # Largest relative jitter to try.
 MAX_JITTER = 1e-2
+# Directions with a smaller share of a semi-definite matrix than this are rounding errors.
+_NO_DIRECTION = 1e-12
 # Number of rows of a triangular matrix to multiply at once.
 _BAND = 48
 
@@ -64,6 +66,16 @@ def jittered_cholesky(
         jitter = max(10.0 * jitter, 1e-15)
         if jitter > most:
             raise NotPositiveDefiniteError(f"not positive definite with a relative jitter of {most}")
+
+
+def semidefinite_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse (n, n) of a symmetric positive semi-definite matrix, in units of its diagonal."""
+    sizes = np.sqrt(np.maximum(diagonal_of(matrix), 0.0))
+    by = np.where(sizes > 0.0, sizes, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.multiply.outer(by, by))
+    kept = values > _NO_DIRECTION * max(values.max(initial=0.0), np.finfo(float).tiny)
+    root = vectors[:, kept] / np.sqrt(values[kept]) / by[:, np.newaxis]
+    return root @ root.T
 
 
 def covariance_root(covariance: np.ndarray) -> np.ndarray:

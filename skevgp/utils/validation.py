@@ -33,7 +33,7 @@ def check_integer(value: Any, name: str, *, minimum: int) -> int:
     return int(value)
 
 
-def check_real(value: Any, name: str, *, minimum: float, strict: bool = False) -> float:
+def check_real(value: Any, name: str, *, minimum: float = -np.inf, strict: bool = False) -> float:
     """Return a finite number not below (``strict``: above) ``minimum``, or raise an error that names it."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number; got {value!r}.")

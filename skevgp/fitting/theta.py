@@ -1,0 +1,375 @@
+"""Fits of feature maps with parameters θ: fits, and Newton steps of θ, alternate.
+
+Each fit has the features h(x; θ̂) and the columns D = ∂h/∂z of `model.weights`, where z are coordinates of θ that are
+standard normal a priori. Their weights K (z - ẑ) have the prior of z, so that kernel and noise are learned with θ
+integrated out, to first order. Given kernel and noise, ẑ is the mode of p(z | y) with the weights β integrated out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Protocol, Self
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from ..data.dataset import Dataset
+from ..data.maps import evenly_spaced, take_rows
+from ..data.rows import Source, times_weights
+from ..exceptions import UnidentifiedWarning, warn_user
+from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
+from ..model.predictor import CoefficientPrior
+from ..model.weights import ThetaStep, WeightLikelihood, theta_step
+from ..utils.linalg import jittered_cholesky
+from ..utils.monitor import Monitor
+from ..utils.validation import is_dask
+from .problem import Problem
+
+# Newton steps end if they are shorter than this many posterior standard deviations, or after so many.
+_SETTLED, _STEPS = 0.02, 20
+# Largest step, in prior standard deviations, and how often a step is halved.
+_LONGEST, _HALVINGS = 1.0, 7
+# Another fit follows if θ moved by more than this many posterior standard deviations since the last one.
+_MOVED, _FITS = 0.5, 4
+# Number of rows for the starts, of values of θ that are tried per parameter, and of those that are improved.
+_START_ROWS, _TRIED, _IMPROVED = 300, 8, 4
+# Optima of the features alone are different starts if they are so far apart, in prior standard deviations, and if their
+# residuals are not larger than this many times the smallest ones.
+_APART, _AS_GOOD = 0.5, 1.5
+# Noise and parameters of the features alone are found in so many turns. The residuals are not below this share of y².
+_TURNS, _LEAST_RESIDUAL = 3, 1e-14
+# Number of starts with a Gaussian process.
+_STARTS = 3
+# The data do not identify a parameter if its posterior standard deviation is above this share of the prior's.
+_UNIDENTIFIED = 0.95
+
+
+class FitOfTheta(Protocol):
+    """The part of `Fitted` and `ExactFit` that is needed here."""
+
+    @property
+    def prior(self) -> CoefficientPrior:
+        """The prior of all weights in the user's units, with learned scales."""
+
+    @property
+    def lower_bound(self) -> float:
+        """Lower bound on the log marginal likelihood, in nats."""
+
+    def moved(self, source: Source, prior: CoefficientPrior) -> Self:
+        """The same kernel and noise, with other features and a prior of their weights."""
+
+    def weight_likelihoods(self, source: Source, prior: CoefficientPrior) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, for other features, in the user's units."""
+
+
+# Takes a problem, an earlier fit to continue and whether a rough result is enough.
+FitProblem = Callable[[Problem, Any, bool], Any]
+# Takes z and the step before. None: the features are not finite at z.
+StepAt = Callable[[np.ndarray, ThetaStep], ThetaStep | None]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A fit with parameters θ."""
+
+    data: Dataset
+    problem: Problem
+    fitted: Any
+    posterior: ThetaPosterior
+
+    def warn(self) -> None:
+        """Warn if the data do not identify a parameter."""
+        if names := self.posterior.unidentified():
+            warn_user(
+                f"The data do not identify the parameters {names}: their posterior is as wide as their prior. Fix "
+                "them, give them a narrower prior, or add rows in which they matter.",
+                UnidentifiedWarning,
+            )
+
+
+@dataclass(frozen=True)
+class ThetaPosterior:
+    """The posterior of z."""
+
+    theta: Theta
+    # (q,) and (q, q): mean and covariance of z.
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, theta: Theta, step: ThetaStep) -> ThetaPosterior:
+        """The posterior at a value of z, to first order."""
+        return cls(theta, step.z + step.newton(), np.linalg.inv(step.precision))
+
+    def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
+        """Posterior medians and standard deviations by name, and the covariance (q, q) of the parameters."""
+        slopes = self.theta.slopes(self.mean)
+        covariance = self.covariance * np.multiply.outer(slopes, slopes)
+        names, std = self.theta.names, np.sqrt(np.diagonal(covariance))
+        values = self.theta.values(self.mean)
+        return dict(zip(names, values.tolist(), strict=True)), dict(zip(names, std.tolist(), strict=True)), covariance
+
+    def unidentified(self) -> list[str]:
+        """Names of the parameters of which the data say nothing."""
+        wide = np.sqrt(np.diagonal(self.covariance)) > _UNIDENTIFIED
+        return [name for name, own in zip(self.theta.names, wide, strict=True) if own]
+
+    def intervals(self, probability: float = 0.95) -> dict[str, tuple[float, float]]:
+        """A credible interval of each parameter. It stays within the bounds of the prior."""
+        reach = float(ndtri(0.5 + 0.5 * probability)) * np.sqrt(np.diagonal(self.covariance))
+        edges = [self.theta.values(self.mean + sign * reach) for sign in (-1.0, 1.0)]
+        return {
+            name: (low, high) for name, low, high in zip(self.theta.names, *map(np.ndarray.tolist, edges), strict=True)
+        }
+
+
+# --- features and priors at a value of θ ------------------------------------------------------------------------------
+
+
+def map_at(feature_map: Any, z: np.ndarray) -> Any:
+    """A copy of a fitted map with its parameters at z (q,)."""
+    copied = deepcopy(feature_map)
+    theta = Theta.of(copied)
+    assert theta is not None
+    theta.set(z)
+    return copied
+
+
+def columns_of(feature_map: Any, rows: Any, theta: Theta) -> np.ndarray:
+    """The feature and the parameter (d, 2) of each column of ∂h/∂z that is not 0 on some rows."""
+    jacobian = theta_jacobian(feature_map, rows, theta)
+    return np.argwhere(np.abs(jacobian).reshape(-1, *jacobian.shape[-2:]).max(axis=0) > 0.0)
+
+
+def extended(prior: CoefficientPrior, step: ThetaStep) -> CoefficientPrior:
+    """The prior of the weights of (h, D), given that of h. Each output's z has its prior given the other outputs."""
+    (o, p), d = prior.scale.shape, step.K.shape[1]
+    # Parameters without a column have no part in it.
+    active = np.flatnonzero(np.abs(step.K).max(axis=(0, 1), initial=0.0) > 0.0)
+    mean, scale, reference = (np.zeros((o, p + d)) for _ in range(3))
+    mean[:, :p], reference[:, :p] = prior.mean, prior.reference
+    root = np.zeros((o, p + d, p + d))
+    root[:, :p, :p] = prior.roots()
+    for output in range(o):
+        # Shared weights have one posterior, and all of the information is in the first output.
+        from_others, precision = step.cavity(0 if prior.shared else output)
+        covariance = np.linalg.inv(precision)[np.ix_(active, active)]
+        L, K = jittered_cholesky(covariance), step.K[output][:, active]
+        mean[output, p:] = K @ from_others[active]
+        root[output, p:, p : p + len(active)] = K @ L
+        reference[output, p : p + len(active)] = -np.linalg.solve(L, from_others[active])
+    scale[...] = np.sqrt(np.square(root).sum(axis=2))
+    groups = None if prior.groups is None else np.hstack([prior.groups, np.full((o, d), -1)])
+    return CoefficientPrior(mean, scale, reference, root, prior.shared, prior.labels, groups)
+
+
+def restricted(prior: CoefficientPrior, p: int) -> CoefficientPrior:
+    """The prior of the first p weights."""
+    root = None if prior.root is None else prior.root[:, :p, :p]
+    groups = None if prior.groups is None else prior.groups[:, :p]
+    return replace(
+        prior,
+        mean=prior.mean[:, :p],
+        scale=prior.scale[:, :p],
+        reference=prior.reference[:, :p],
+        root=root,
+        groups=groups,
+    )
+
+
+class _Calibrator:
+    """The data and the prior of a fit with parameters."""
+
+    def __init__(self, data: Dataset, problem: Problem, theta: Theta):
+        self.data, self.problem, self.theta = data, problem, theta
+        self.prior = problem.units.prior
+        self.p = self.prior.scale.shape[1]
+        self.feature_map = data.maps.feature_map
+        self.sample, targets = _sample(data)
+        self.targets = targets - problem.units.target_mean
+        self.columns = columns_of(self.feature_map, self.sample, theta)
+
+    def data_at(self, z: np.ndarray) -> Dataset:
+        """The data with the features linearised at z."""
+        return self.data.through(LinearizedFeatures(map_at(self.feature_map, z), self.columns))
+
+    # --- the features alone, on a sample ------------------------------------------------------------------------------
+
+    def features(self, z: np.ndarray) -> np.ndarray:
+        """The features of the sample, linearised at z, (k, p + d) or (k, o, p + d). They may be infinite or NaN."""
+        with np.errstate(all="ignore"):
+            return LinearizedFeatures(map_at(self.feature_map, z), self.columns).transform(self.sample)
+
+    def alone(self, z: np.ndarray, noise: np.ndarray) -> ThetaStep | None:
+        """What the sample says about z without a Gaussian process, for noise variances (o,). None: it is not finite."""
+        features, likelihoods = self.features(z), []
+        if not np.isfinite(features).all():
+            return None
+        prior = replace(self.prior, reference=np.zeros_like(self.prior.reference))
+        for o, variance in enumerate(noise):
+            H = features if features.ndim == 2 else features[:, o]
+            r = self.targets[:, o] - H[:, : self.p] @ prior.mean[o]
+            likelihoods.append(WeightLikelihood(H.T @ H / variance, H.T @ r / variance, float(r @ r / variance)))
+        return theta_step(likelihoods, prior, self.columns, z)
+
+    def residual_variance(self, step: ThetaStep) -> np.ndarray:
+        """Mean squared residuals (o,) of the features at a value of z."""
+        fitted = times_weights(self.features(step.z)[..., : self.p], step.beta)
+        squares = np.mean(self.targets**2, axis=0)
+        least = _LEAST_RESIDUAL * np.where(squares > 0.0, squares, 1.0)
+        return np.maximum(np.mean((self.targets - fitted) ** 2, axis=0), least)
+
+    def starts(self, seed: int) -> list[ThetaStep]:
+        """Different optima of the features alone, the best one first."""
+        q = len(self.theta)
+        tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(int(np.ceil(np.log2(_TRIED * q)))))
+        squares = np.mean(self.targets**2, axis=0)
+        first = self.alone(np.zeros(q), np.where(squares > 0.0, squares, 1.0))
+        assert first is not None
+        noise = self.residual_variance(first)
+        values = [-np.inf if (step := self.alone(z, noise)) is None else step.value for z in tried]
+        best = [tried[i] for i in np.argsort(values)[::-1][: _IMPROVED - 1] if np.isfinite(values[i])]
+        found = [self.improved(z, noise) for z in (np.zeros(q), *best)]
+        # Minus twice the log evidence with the noise variance of the residuals.
+        loss = [len(self.targets) * float(np.log(own).sum()) + float(step.z @ step.z) for step, own in found]
+        distinct: list[ThetaStep] = []
+        for step, own in (found[i] for i in np.argsort(loss)):
+            as_good = (own <= _AS_GOOD**2 * found[int(np.argmin(loss))][1]).all()
+            if as_good and all(np.abs(step.z - other.z).max() > _APART for other in distinct):
+                distinct.append(step)
+        return distinct[:_STARTS]
+
+    def improved(self, z: np.ndarray, noise: np.ndarray) -> tuple[ThetaStep, np.ndarray]:
+        """An optimum of the features alone from z, and the mean squared residuals (o,) there."""
+        step = self.alone(z, noise)
+        for _ in range(_TURNS):
+            assert step is not None
+            step = climbed(step, self._with_noise(noise))
+            noise = self.residual_variance(step)
+            step = self.alone(step.z, noise)
+        assert step is not None
+        return step, noise
+
+    def _with_noise(self, noise: np.ndarray) -> StepAt:
+        return lambda z, before: self.alone(z, noise)
+
+    # --- with a Gaussian process --------------------------------------------------------------------------------------
+
+    def finished(self, step: ThetaStep, data: Dataset, fitted: FitOfTheta) -> Any:
+        """A fit with the features and the prior at a value of z."""
+        prior = replace(restricted(fitted.prior, self.p), reference=step.reference)
+        return fitted.moved(data.source, extended(prior, step))
+
+    def problem_at(self, step: ThetaStep, data: Dataset) -> Problem:
+        """The problem with the features linearised at a value of z."""
+        return self.problem.with_features(data, extended(self.prior, step))
+
+    def step_at(self, fitted: FitOfTheta, z: np.ndarray, before: ThetaStep) -> ThetaStep | None:
+        """What the data say about z under the kernel and noise of a fit. None: the features are not finite."""
+        try:
+            data = self.data_at(z)
+        except ValueError:
+            return None
+        prior = replace(restricted(fitted.prior, self.p), reference=before.reference)
+        likelihoods = fitted.weight_likelihoods(data.source, extended(prior, before))
+        return theta_step(likelihoods, prior, self.columns, z)
+
+    def settled(self, step: ThetaStep, fitted: FitOfTheta) -> ThetaStep:
+        """The mode of z under the kernel and noise of a fit."""
+        here = self.step_at(fitted, step.z, step)
+        assert here is not None
+        return climbed(here, partial(self.step_at, fitted))
+
+
+def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
+    """Newton steps of z. Each is shortened until it raises log p(y, z), or is followed by a much shorter one."""
+    for _ in range(_STEPS):
+        move = step.newton()
+        length, share = _length(move, step), min(1.0, _LONGEST / max(np.abs(move).max(), np.finfo(float).tiny))
+        if length < _SETTLED:
+            break
+        for _ in range(_HALVINGS):
+            there = step_at(step.z + share * move, step)
+            if there is not None and (there.value > step.value or _length(there.newton(), there) < 0.5 * length):
+                break
+            share /= 2.0
+        else:
+            break
+        assert there is not None
+        step = there
+    return step
+
+
+def _length(move: np.ndarray, step: ThetaStep) -> float:
+    """The largest component of a step, in posterior standard deviations."""
+    return float(np.max(np.abs(move) / np.sqrt(np.diagonal(np.linalg.inv(step.precision)))))
+
+
+def _sample(data: Dataset) -> tuple[Any, np.ndarray]:
+    """Some rows of X for the feature map, and their targets (k, o)."""
+    if is_dask(data.X):
+        chosen = evenly_spaced(len(data.X), _START_ROWS)
+        X, y = data.X[chosen].compute(), data.y[chosen].compute()
+    else:
+        positions = data.chosen.positions
+        chosen = evenly_spaced(data.chosen.n_rows, _START_ROWS)
+        chosen = chosen if positions is None else positions[chosen]
+        X, y = take_rows(data.given, chosen), data.y[chosen]
+    return X, np.asarray(y, dtype=np.float64).reshape(len(y), -1)
+
+
+def calibrate(
+    data: Dataset, problem: Problem, fit: FitProblem, rng: np.random.RandomState, monitor: Monitor
+) -> Calibration | None:
+    """Fit a problem whose feature map has parameters, or return None if it has none.
+
+    ``problem`` is that of the prior medians. The prior of the weights is found there.
+    """
+    theta = None if data.maps.feature_map is None else Theta.of(data.maps.feature_map)
+    if theta is None:
+        return None
+    solver, noise = problem.solver, problem.noise
+    if solver.stochastic or problem.family == "diagonal" or noise.heavy_tails or noise.inputs is not None:
+        raise ValueError(
+            f'A feature map with parameters ({", ".join(theta.names)}) needs solver="lbfgs" or an LBFGS(...) with '
+            f'posterior="full", and Gaussian noise of y only; got solver={solver!r} and noise={noise!r}.'
+        )
+    own = _Calibrator(data, problem, theta)
+    best: tuple[float, ThetaStep, Any] | None = None
+    starts = own.starts(rng.randint(np.iinfo(np.int32).max))
+    for step in starts:
+        fitted = fit(own.problem_at(step, own.data_at(step.z)), None, True)
+        step = own.settled(step, fitted)
+        bound = -0.5 * float(step.z @ step.z)
+        if len(starts) > 1:
+            bound += own.finished(step, own.data_at(step.z), fitted).lower_bound
+        if best is None or bound > best[0]:
+            best = bound, step, fitted
+    assert best is not None
+    _, step, fitted = best
+    for _ in range(_FITS):
+        fitted, before = fit(own.problem_at(step, own.data_at(step.z)), fitted, False), step
+        step = own.settled(step, fitted)
+        ended = problem.max_iter == 0 or monitor.stopped or monitor.out_of_time
+        if ended or _length(step.z - before.z, step) < _MOVED:
+            break
+    at_mode = own.data_at(step.z)
+    found = Theta.of(at_mode.maps.feature_map.feature_map)
+    assert found is not None
+    posterior = ThetaPosterior.of(found, step)
+    return Calibration(at_mode, own.problem_at(step, at_mode), own.finished(step, at_mode, fitted), posterior)
+
+
+def after_more_rows(
+    posterior: ThetaPosterior, linearized: LinearizedFeatures, fitted: Any
+) -> tuple[ThetaPosterior, Any]:
+    """The posterior of z, and the models, after new rows. The features stay linearised where they are."""
+    p = fitted.prior.scale.shape[1] - len(linearized.columns)
+    prior = restricted(fitted.prior, p)
+    z = posterior.theta.coordinates()
+    step = theta_step(fitted.weight_likelihoods(), prior, linearized.columns, z)
+    return ThetaPosterior.of(posterior.theta, step), fitted.reweighted(extended(prior, step))
