@@ -26,7 +26,6 @@ _FARTHEST = 6.0
 class Prior(ABC):
     """The prior of a parameter, as a function of a coordinate z that is standard normal a priori."""
 
-    @abstractmethod
     def value(self, z: float) -> float:
         """Return the value of the parameter at a coordinate.
 
@@ -40,8 +39,8 @@ class Prior(ABC):
         value : float
             Value, in units of the parameter.
         """
+        return self._value(z)
 
-    @abstractmethod
     def slope(self, z: float) -> float:
         """Return the derivative of the value in the coordinate.
 
@@ -55,8 +54,8 @@ class Prior(ABC):
         slope : float
             Derivative, above 0.
         """
+        return self._slope(z)
 
-    @abstractmethod
     def coordinate(self, value: float) -> float:
         """Return the coordinate of a value.
 
@@ -70,6 +69,16 @@ class Prior(ABC):
         z : float
             Coordinate, the inverse of `value`.
         """
+        return self._coordinate(value)
+
+    @abstractmethod
+    def _value(self, z: float) -> float: ...
+
+    @abstractmethod
+    def _slope(self, z: float) -> float: ...
+
+    @abstractmethod
+    def _coordinate(self, value: float) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -102,13 +111,13 @@ class Normal(Prior):
         check_real(self.mean, "mean")
         check_real(self.std, "std", minimum=0.0, strict=True)
 
-    def value(self, z: float) -> float:
+    def _value(self, z: float) -> float:
         return self.mean + self.std * z
 
-    def slope(self, z: float) -> float:
+    def _slope(self, z: float) -> float:
         return self.std
 
-    def coordinate(self, value: float) -> float:
+    def _coordinate(self, value: float) -> float:
         return (value - self.mean) / self.std
 
 
@@ -144,13 +153,13 @@ class LogNormal(Prior):
         check_real(self.median, "median", minimum=0.0, strict=True)
         check_real(self.sigma, "sigma", minimum=0.0, strict=True)
 
-    def value(self, z: float) -> float:
+    def _value(self, z: float) -> float:
         return float(self.median * np.exp(self.sigma * z))
 
-    def slope(self, z: float) -> float:
-        return self.sigma * self.value(z)
+    def _slope(self, z: float) -> float:
+        return self.sigma * self._value(z)
 
-    def coordinate(self, value: float) -> float:
+    def _coordinate(self, value: float) -> float:
         return float(np.log(value / self.median)) / self.sigma
 
 
@@ -184,15 +193,15 @@ class Uniform(Prior):
         if not self.low < self.high:
             raise ValueError(f"low={self.low!r} must be below high={self.high!r}.")
 
-    def value(self, z: float) -> float:
+    def _value(self, z: float) -> float:
         # θ = low + (high - low) Φ(z): uniform if z is standard normal.
         return float(self.low + (self.high - self.low) * ndtr(np.clip(z, -_FARTHEST, _FARTHEST)))
 
-    def slope(self, z: float) -> float:
+    def _slope(self, z: float) -> float:
         z = np.clip(z, -_FARTHEST, _FARTHEST)
         return float((self.high - self.low) * np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi))
 
-    def coordinate(self, value: float) -> float:
+    def _coordinate(self, value: float) -> float:
         return float(np.clip(ndtri((value - self.low) / (self.high - self.low)), -_FARTHEST, _FARTHEST))
 
 
