@@ -246,17 +246,15 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
 
     def _tangent(self, function: Callable[[Any], Any], at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """The derivative of a function in a direction."""
-        try:
-            tangent: Any = make_jvp(function)(at)
-            tangent(np.zeros_like(at))
-        except Exception as error:
-            raise ValueError(
-                f"autograd cannot differentiate {self!r}: {error} Write the function in autograd.numpy, or use "
-                'derivatives="differences".'
-            ) from error
 
         def along(direction: np.ndarray) -> np.ndarray:
-            value, slope = tangent(direction)
+            try:
+                value, slope = make_jvp(function)(at)(direction)
+            except Exception as error:
+                raise ValueError(
+                    f"autograd cannot differentiate {self!r}: {error} Write the function in autograd.numpy, or use "
+                    'derivatives="differences".'
+                ) from error
             # autograd returns a 0 without a shape if the function does not depend on its argument.
             return np.broadcast_to(np.asarray(slope, dtype=np.float64), np.shape(value))
 

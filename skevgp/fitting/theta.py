@@ -18,11 +18,11 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from ..data.dataset import Dataset
-from ..data.maps import evenly_spaced, take_rows
+from ..data.maps import evenly_spaced, take_rows, transformed
 from ..data.rows import Source, times_weights
 from ..exceptions import UnidentifiedWarning, warn_user
 from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
-from ..model.predictor import CoefficientPrior
+from ..model.predictor import CoefficientPrior, Predictor
 from ..model.weights import ThetaStep, WeightLikelihood, theta_step
 from ..utils.linalg import jittered_cholesky
 from ..utils.monitor import Monitor
@@ -33,10 +33,11 @@ from .problem import Problem
 _SETTLED, _STEPS = 0.02, 20
 # Largest step, in prior standard deviations, and how often a step is halved.
 _LONGEST, _HALVINGS = 1.0, 7
-# Another fit follows if θ moved by more than this many posterior standard deviations since the last one.
-_MOVED, _FITS = 0.5, 4
-# Number of rows for the starts, of values of θ that are tried per parameter, and of those that are improved.
-_START_ROWS, _TRIED, _IMPROVED = 300, 8, 4
+# Another fit follows, up to so many in all, if the features of the last one were not linear in θ on the way to its
+# mode: if their errors have an rms of more than this many standard deviations of the noise.
+_NONLINEAR, _FITS = 0.1, 4
+# Number of rows for the starts, of values of θ that are tried per parameter, and of the best of them that are improved.
+_START_ROWS, _TRIED, _IMPROVED = 500, 8, 2
 # Optima of the features alone are different starts if they are so far apart, in prior standard deviations, and if their
 # residuals are not larger than this many times the smallest ones.
 _APART, _AS_GOOD = 0.5, 1.5
@@ -44,6 +45,8 @@ _APART, _AS_GOOD = 0.5, 1.5
 _TURNS, _LEAST_RESIDUAL = 3, 1e-14
 # Number of starts with a Gaussian process.
 _STARTS = 3
+# Step of differences, in posterior standard deviations.
+_DIFFERENCE = 0.1
 # The data do not identify a parameter if its posterior standard deviation is above this share of the prior's.
 _UNIDENTIFIED = 0.95
 
@@ -64,6 +67,9 @@ class FitOfTheta(Protocol):
 
     def weight_likelihoods(self, source: Source, prior: CoefficientPrior) -> list[WeightLikelihood]:
         """The likelihood of the weights of each output, for other features, in the user's units."""
+
+    def predictor(self) -> Predictor:
+        """The predictor of all outputs, in the user's units."""
 
 
 # Takes a problem, an earlier fit to continue and whether a rough result is enough.
@@ -192,6 +198,8 @@ class _Calibrator:
         self.sample, targets = _sample(data)
         self.targets = targets - problem.units.target_mean
         self.columns = columns_of(self.feature_map, self.sample, theta)
+        # z of the last features of the sample.
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     def data_at(self, z: np.ndarray) -> Dataset:
         """The data with the features linearised at z."""
@@ -201,20 +209,33 @@ class _Calibrator:
 
     def features(self, z: np.ndarray) -> np.ndarray:
         """The features of the sample, linearised at z, (k, p + d) or (k, o, p + d). They may be infinite or NaN."""
-        with np.errstate(all="ignore"):
-            return LinearizedFeatures(map_at(self.feature_map, z), self.columns).transform(self.sample)
+        if self._last is None or not np.array_equal(self._last[0], z):
+            with np.errstate(all="ignore"):
+                linearized = LinearizedFeatures(map_at(self.feature_map, z), self.columns)
+                self._last = z, linearized.transform(self.sample)
+        return self._last[1]
 
     def alone(self, z: np.ndarray, noise: np.ndarray) -> ThetaStep | None:
         """What the sample says about z without a Gaussian process, for noise variances (o,). None: it is not finite."""
-        features, likelihoods = self.features(z), []
+        return self._alone(self.features(z), z, noise, self.columns)
+
+    def value_alone(self, z: np.ndarray, noise: np.ndarray) -> float:
+        """The log density of the sample and z without a Gaussian process. -inf: the features are not finite."""
+        with np.errstate(all="ignore"):
+            features = np.asarray(transformed(map_at(self.feature_map, z), self.sample), dtype=np.float64)
+        step = self._alone(features, z, noise, self.columns[:0])
+        return -np.inf if step is None else step.value
+
+    def _alone(self, features: np.ndarray, z: np.ndarray, noise: np.ndarray, columns: np.ndarray) -> ThetaStep | None:
         if not np.isfinite(features).all():
             return None
+        likelihoods = []
         prior = replace(self.prior, reference=np.zeros_like(self.prior.reference))
         for o, variance in enumerate(noise):
             H = features if features.ndim == 2 else features[:, o]
             r = self.targets[:, o] - H[:, : self.p] @ prior.mean[o]
             likelihoods.append(WeightLikelihood(H.T @ H / variance, H.T @ r / variance, float(r @ r / variance)))
-        return theta_step(likelihoods, prior, self.columns, z)
+        return theta_step(likelihoods, prior, columns, z)
 
     def residual_variance(self, step: ThetaStep) -> np.ndarray:
         """Mean squared residuals (o,) of the features at a value of z."""
@@ -222,6 +243,13 @@ class _Calibrator:
         squares = np.mean(self.targets**2, axis=0)
         least = _LEAST_RESIDUAL * np.where(squares > 0.0, squares, 1.0)
         return np.maximum(np.mean((self.targets - fitted) ** 2, axis=0), least)
+
+    def nonlinearity(self, before: ThetaStep, after: ThetaStep) -> np.ndarray:
+        """Mean squared error (o,) of the features at a value of z, linearised at another."""
+        then, now, p = self.features(before.z), self.features(after.z), self.p
+        moved = times_weights(now[..., :p] - then[..., :p], after.beta)
+        moved -= times_weights(then[..., p:], after.K @ (after.z - before.z))
+        return np.mean(moved**2, axis=0)
 
     def starts(self, seed: int) -> list[ThetaStep]:
         """Different optima of the features alone, the best one first."""
@@ -231,9 +259,10 @@ class _Calibrator:
         first = self.alone(np.zeros(q), np.where(squares > 0.0, squares, 1.0))
         assert first is not None
         noise = self.residual_variance(first)
-        values = [-np.inf if (step := self.alone(z, noise)) is None else step.value for z in tried]
-        best = [tried[i] for i in np.argsort(values)[::-1][: _IMPROVED - 1] if np.isfinite(values[i])]
-        found = [self.improved(z, noise) for z in (np.zeros(q), *best)]
+        found = [self.improved(np.zeros(q), noise)]
+        values = [self.value_alone(z, noise) for z in tried]
+        best = [tried[i] for i in np.argsort(values)[::-1][:_IMPROVED] if np.isfinite(values[i])]
+        found += [self.improved(z, noise) for z in best]
         # Minus twice the log evidence with the noise variance of the residuals.
         loss = [len(self.targets) * float(np.log(own).sum()) + float(step.z @ step.z) for step, own in found]
         distinct: list[ThetaStep] = []
@@ -283,6 +312,21 @@ class _Calibrator:
         here = self.step_at(fitted, step.z, step)
         assert here is not None
         return climbed(here, partial(self.step_at, fitted))
+
+    def covariance_of_best_fit(self, step: ThetaStep, fitted: FitOfTheta) -> np.ndarray:
+        """The posterior covariance (q, q) of z if f is orthogonal to the features."""
+        # z is then that of the best fit in least squares, where the gradient s(z) = σ⁻² Jᵀ (y - h(z)) - z is 0. The
+        # residuals contain f and may be large, so that Gauss and Newton's s' = -Λ (see `ThetaStep.precision`) is not
+        # good enough. As Var[s] is Λ to first order, the covariance is (s')⁻¹ Λ (s')⁻ᵀ (White 1982).
+        std, slopes = np.sqrt(np.diagonal(np.linalg.inv(step.precision))), []
+        for direction, size in zip(np.eye(len(std)), _DIFFERENCE * std, strict=True):
+            ends = [self.step_at(fitted, step.z + sign * size * direction, step) for sign in (1.0, -1.0)]
+            if ends[0] is None or ends[1] is None:
+                return np.linalg.inv(step.precision)
+            forward, back = (end.gradient.sum(axis=0) - end.z for end in ends if end is not None)
+            slopes.append((forward - back) / (2.0 * size))
+        slope_inv = np.linalg.pinv(np.array(slopes).T)
+        return slope_inv @ step.precision @ slope_inv.T
 
 
 def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
@@ -341,26 +385,27 @@ def calibrate(
     own = _Calibrator(data, problem, theta)
     best: tuple[float, ThetaStep, Any] | None = None
     starts = own.starts(rng.randint(np.iinfo(np.int32).max))
-    for step in starts:
-        fitted = fit(own.problem_at(step, own.data_at(step.z)), None, True)
-        step = own.settled(step, fitted)
-        bound = -0.5 * float(step.z @ step.z)
-        if len(starts) > 1:
-            bound += own.finished(step, own.data_at(step.z), fitted).lower_bound
+    step = starts[0]
+    fitted: Any = None
+    for start in starts if len(starts) > 1 else ():
+        rough = fit(own.problem_at(start, own.data_at(start.z)), None, True)
+        start = own.settled(start, rough)
+        bound = own.finished(start, own.data_at(start.z), rough).lower_bound - 0.5 * float(start.z @ start.z)
         if best is None or bound > best[0]:
-            best = bound, step, fitted
-    assert best is not None
-    _, step, fitted = best
+            best = bound, start, rough
+            _, step, fitted = best
     for _ in range(_FITS):
         fitted, before = fit(own.problem_at(step, own.data_at(step.z)), fitted, False), step
         step = own.settled(step, fitted)
         ended = problem.max_iter == 0 or monitor.stopped or monitor.out_of_time
-        if ended or _length(step.z - before.z, step) < _MOVED:
+        if ended or (own.nonlinearity(before, step) < _NONLINEAR**2 * fitted.predictor().noise).all():
             break
     at_mode = own.data_at(step.z)
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
     posterior = ThetaPosterior.of(found, step)
+    if problem.orthogonal:
+        posterior = replace(posterior, covariance=own.covariance_of_best_fit(step, fitted))
     return Calibration(at_mode, own.problem_at(step, at_mode), own.finished(step, at_mode, fitted), posterior)
 
 
