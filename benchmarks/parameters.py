@@ -8,9 +8,9 @@
 
 *pendulum*: a simulated pendulum of 1 kg with viscous and Stribeck friction, four trajectories of 100 steps of 0.03 s,
 changes of the velocity with 1 % noise. Medians of the priors are 20 % off. "learned" has a `ParametricFeatures` of one
-step of Runge and Kutta's rule with four parameters. "fixed, 20 % off" has the same function with all parameters 20 % too
-large, "fixed, right" with the true ones. With a ripple, the motor has a torque that depends on the angle, which the
-function does not know. Errors are those of four other trajectories.
+step of Runge and Kutta's rule with four parameters. "fixed, 20 % off" has the same function with all parameters too
+large by 20 %, "fixed, right" with the true ones. With a ripple, the motor has a torque that depends on the angle, which
+the function does not know. Errors are those of four other trajectories.
 
 *misfit*: wrong simulators of one parameter. "line" is that of Plumlee (2017): 4 x + x sin(5 x) on [0, 1], simulated by
 θ x. "decay" is that of Bayarri et al. (2007): 3.5 exp(-1.7 x) + 1.5 on [0, 3], simulated by 5 exp(-θ x). The true value
