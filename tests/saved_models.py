@@ -39,11 +39,14 @@ from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor,
 from skevgp.datasets import load_robot
 from skevgp.features import (
     AngleEncoder,
+    Friction,
     InertiaForce,
     InertiaForceGravity,
     LinkGravity,
+    LogNormal,
     NominalDynamics,
     RigidBodyRegressor,
+    Uniform,
 )
 from skevgp.kernels import Cosine
 from skevgp.noise import Gaussian
@@ -168,6 +171,8 @@ CASES = {
     "a-system": (evgp(InertiaForceGravity(get_system("acrobot"))), *_ACROBOT),
     "levers": (evgp(LinkGravity("acrobot")), *_ACROBOT),
     "nominal": (evgp(NominalDynamics("acrobot")), *_ACROBOT),
+    "factors": (evgp(NominalDynamics("acrobot", parameters={"mass(q1)": LogNormal(1.0, 2.0)})), *_ACROBOT),
+    "friction": (evgp(Friction("acrobot", parameters={"sharpness": Uniform(0.5, 2.5)})), *_ACROBOT),
     "nominal-of-a-model": (evgp(NominalDynamics(load_robot("acrobot"))), *_ACROBOT),
     "time-steps": (
         evgp(InertiaForceGravity("acrobot", dt="column")),

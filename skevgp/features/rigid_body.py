@@ -61,7 +61,8 @@ class RigidBodyRegressor(ParametricMap):
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
         Priors of unknown velocities v_s, instead of ``stiction_velocity``. Names are ``"stiction_velocity"`` for one of
         all joints, or the joint's in brackets, such as ``{"stiction_velocity(elbow)": LogNormal(0.01, 1.0)}``. The
-        regressor learns their values. If None, they are as in ``stiction_velocity``.
+        regressor learns their values. If None, they are as in ``stiction_velocity``. `skevgp.InverseDynamics` finds
+        them without parameters.
 
     Attributes
     ----------
