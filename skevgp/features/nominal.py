@@ -248,10 +248,10 @@ class NominalDynamics(ParametricMap, RobotMap):
     def _synonym(self, name: str) -> str:
         kind, _, owner = name.removesuffix(")").partition("(")
         joints = list(self._model().names)[1:]
-        if kind not in _OF_LINKS or owner in joints:
+        if kind not in _OF_LINKS or owner in joints or not name.endswith(")"):
             return name
         for frame in self._model().frames:
-            if frame.name == owner and frame.parentJoint > 0:
+            if frame.name == owner and frame.type.name == "BODY" and frame.parentJoint > 0:
                 return f"{kind}({joints[frame.parentJoint - 1]})"
         return name
 

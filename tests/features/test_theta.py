@@ -169,6 +169,10 @@ INVALID = {
         NominalDynamics("ur5", parameters={"mass(base_link)": POSITIVE}),
         "no parameter 'mass(base_link)'",
     ),
+    "fixed joint": (
+        NominalDynamics("ur5", parameters={"mass(ee_fixed_joint)": POSITIVE}),
+        "no parameter 'mass(ee_fixed_joint)'",
+    ),
     "link's name for damping": (
         NominalDynamics("acrobot", parameters={"damping(link)": POSITIVE}),
         "no parameter 'damping(link)'",
