@@ -36,14 +36,17 @@ from sklearn.preprocessing import (
 )
 
 from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
-from skevgp.datasets import load_robot
+from skevgp.datasets import load_robot, perturb_robot
 from skevgp.features import (
     AngleEncoder,
+    Friction,
     InertiaForce,
     InertiaForceGravity,
     LinkGravity,
+    LogNormal,
     NominalDynamics,
     RigidBodyRegressor,
+    Uniform,
 )
 from skevgp.kernels import Cosine
 from skevgp.noise import Gaussian
@@ -55,6 +58,11 @@ X, X_NEW = RNG.uniform(-2.0, 2.0, (60, 2)), RNG.uniform(-2.0, 2.0, (7, 2))
 Y = np.column_stack([np.sin(2.0 * X[:, 0]), X[:, 0] * X[:, 1], X[:, 1] ** 2]) + 0.05 * RNG.randn(60, 3)
 ROWS, ROWS_NEW = RNG.uniform(0.1, 1.0, (60, 5)), RNG.uniform(0.1, 1.0, (7, 5))  # of the acrobot
 STATES = ROWS[:, :4] + 0.1 * np.sin(ROWS[:, 1:]) + 0.01 * RNG.randn(60, 4)
+
+# Changes of the velocities of another acrobot.
+CHANGES = 0.03 * NominalDynamics(perturb_robot("acrobot", 0.3, random_state=0)).fit_transform(ROWS)
+CHANGES += 0.001 * np.random.RandomState(1).randn(60, 2)
+_FACTOR = {"outputs": ["dq1/dt", "dq2/dt"], "parameters": {"mass(q1)": LogNormal(1.0, 0.5)}}
 
 
 def frame(rows):
@@ -168,6 +176,8 @@ CASES = {
     "a-system": (evgp(InertiaForceGravity(get_system("acrobot"))), *_ACROBOT),
     "levers": (evgp(LinkGravity("acrobot")), *_ACROBOT),
     "nominal": (evgp(NominalDynamics("acrobot")), *_ACROBOT),
+    "factors": (evgp(NominalDynamics("acrobot", **_FACTOR)), ROWS, CHANGES, ROWS_NEW),
+    "friction": (evgp(Friction("acrobot", parameters={"sharpness": Uniform(0.5, 2.5)})), *_ACROBOT),
     "nominal-of-a-model": (evgp(NominalDynamics(load_robot("acrobot"))), *_ACROBOT),
     "time-steps": (
         evgp(InertiaForceGravity("acrobot", dt="column")),

@@ -11,7 +11,7 @@ from sklearn.preprocessing import StandardScaler
 
 from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
-from skevgp.features import RigidBodyRegressor
+from skevgp.features import LogNormal, RigidBodyRegressor
 from skevgp.robots import RigidBody, inertial_parameters, physical_consistency
 
 
@@ -202,6 +202,9 @@ def test_invalid_input_raises(arm):
         model.fit(np.where(arm.X > 0.5, np.nan, arm.X), arm.y)
     with pytest.raises(ValueError, match="Unknown robot"):
         InverseDynamics("ur55").fit(arm.X, arm.y)
+    body = RigidBodyRegressor("ur5", parameters={"stiction_velocity": LogNormal(0.01, 1.0)})
+    with pytest.raises(ValueError, match=r"leave the parameters .* at None; got \['stiction_velocity'\]"):
+        InverseDynamics(body).fit(arm.X, arm.y)
     assert not hasattr(model, "coef_")
 
 

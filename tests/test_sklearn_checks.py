@@ -6,6 +6,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.features import (
     AngleEncoder,
+    Friction,
     InertiaForce,
     InertiaForceGravity,
     LinkGravity,
@@ -17,6 +18,7 @@ from skevgp.solvers import LBFGS
 pytestmark = pytest.mark.long
 MAPS = [
     AngleEncoder(),
+    Friction(),
     InertiaForce(),
     InertiaForce(dt="column"),
     InertiaForceGravity(),

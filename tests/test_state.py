@@ -12,7 +12,7 @@ import skevgp.utils.state
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor, __version__
 from skevgp.datasets import load_robot
 from skevgp.exceptions import InconsistentVersionWarning
-from skevgp.features import AngleEncoder, InertiaForce, LinkGravity, NominalDynamics, RigidBodyRegressor
+from skevgp.features import AngleEncoder, Friction, InertiaForce, LinkGravity, NominalDynamics, RigidBodyRegressor
 from skevgp.solvers import LBFGS, Adam
 
 ESTIMATORS = [
@@ -24,6 +24,7 @@ ESTIMATORS = [
     LBFGS(),
     Adam(),
     AngleEncoder(),
+    Friction(),
     InertiaForce(),
     LinkGravity(),
     NominalDynamics(),

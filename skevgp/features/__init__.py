@@ -1,6 +1,7 @@
 """Explicit features h(x) from physics, as scikit-learn transformers."""
 
 from .angles import AngleEncoder
+from .friction import Friction
 from .gravity import LinkGravity
 from .newton import InertiaForce, InertiaForceGravity
 from .nominal import NominalDynamics
@@ -10,6 +11,7 @@ from .theta import LogNormal, Normal, Uniform
 
 __all__ = [
     "AngleEncoder",
+    "Friction",
     "InertiaForce",
     "InertiaForceGravity",
     "LinkGravity",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, ClassVar, Literal
@@ -14,7 +14,8 @@ from ..robots.loading import Robot, joint_axes, known_robot
 from ..robots.systems import GRAVITY
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
-from .robot_map import RobotMap, VelocityPrior, indices_of
+from .robot_map import ParametricMap, RobotMap, VelocityPrior, indices_of
+from .theta import Prior
 
 # An axis counts as vertical up to this angle in rad, because URDF files round π/2.
 _TILT = 1e-3
@@ -110,6 +111,34 @@ class SineGravity(GravityMap):
         return [f"sin({' + '.join(columns[list(term.angle)])})" for term in self._terms()]
 
 
+class OffsetAngles(ParametricMap):
+    """A map whose features of gravity take each angle plus an offset, which is a parameter."""
+
+    _signed: ClassVar[tuple[str, ...]] = ("offset",)
+    _offsets: np.ndarray
+
+    def _allowed_parameters(self) -> dict[str, tuple[str, list[int]]]:
+        return self._one_per_joint(["offset"], np.flatnonzero(self._layout.revolute).tolist())
+
+    def _store_theta(self) -> None:
+        self._offsets = np.array(self._at_theta("offset", [0.0] * self._layout.n_joints))
+
+    def _with_offsets(self, X: np.ndarray) -> np.ndarray:
+        """Return rows with the angles of which gravity is a function."""
+        if not self._targets:
+            return X
+        X = X.copy()
+        X[:, : len(self._offsets)] += self._offsets
+        return X
+
+    def _by_offsets(self, by_x: np.ndarray) -> np.ndarray:
+        """Return derivatives in the parameters, given those in x."""
+        return by_x[:, :, [joints[0] for _, joints in self._targets.values()]]
+
+    def _unit(self, kind: str, joints: list[int]) -> str:
+        return "rad"
+
+
 @dataclass(frozen=True)
 class Lever:
     """A feature of `LinkGravity`: gravity on one link along one lever."""
@@ -119,7 +148,7 @@ class Lever:
     acts_on: tuple[int, ...]  # joints between the base and the link
 
 
-class LinkGravity(GravityMap):
+class LinkGravity(OffsetAngles, GravityMap):
     r"""Torque of gravity about the axis of each joint, for a unit mass at the end of a unit lever on its link.
 
     The features of a link i with a revolute joint are
@@ -156,9 +185,16 @@ class LinkGravity(GravityMap):
         Time step Δt of the data in s, which only the prior needs. If None, it is not known: 0.03 s limits the pull, and
         positions do not follow from velocities. If ``"column"``, X has a last column, the time step of each row, and
         features are multiplied by it. Weights are then rates (1/m for a lever).
+    parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
+        Priors of unknown offsets of angles in rad, such as ``{"offset(q1)": Normal(0.0, 0.05)}`` for the position
+        ``q1``. Gravity is computed for the angle in X plus the offset: the zero error of an encoder. Each position of a
+        revolute joint may have one. The regressor learns their values. If None, angles are as in X.
 
     Attributes
     ----------
+    theta_ : dict of str to float
+        Offsets that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
+        ``feature_map_`` of a fitted regressor, they are those of the posterior.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
@@ -199,6 +235,13 @@ class LinkGravity(GravityMap):
     >>> union = FeatureUnion([("inertia", InertiaForce("iiwa14")), ("gravity", LinkGravity("iiwa14", axes="x"))])
     >>> union.fit_transform(np.zeros((1, 21))).shape
     (1, 28)
+
+    An encoder whose zero is known to 0.05 rad:
+
+    >>> from skevgp.features import Normal
+    >>> features = LinkGravity("pendulum", parameters={"offset(q)": Normal(0.0, 0.05)}).fit([[0.0, 0.0, 1.0]])
+    >>> features.theta_
+    {'offset(q)': 0.0}
     """
 
     def __init__(
@@ -212,6 +255,7 @@ class LinkGravity(GravityMap):
         unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         dt: float | Literal["column"] | None = None,
+        parameters: Mapping[str, Prior] | None = None,
     ):
         self.robot = robot
         self.axes = axes
@@ -221,8 +265,10 @@ class LinkGravity(GravityMap):
         self.unknown_ratio = unknown_ratio
         self.coupling_ratio = coupling_ratio
         self.dt = dt
+        self.parameters = parameters
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **OffsetAngles._parameter_constraints,
         **GravityMap._parameter_constraints,
         "axes": [StrOptions({"xy", "x"})],
         "links": ["array-like", None],
@@ -262,18 +308,23 @@ class LinkGravity(GravityMap):
             return X.copy()
         if len(X) > _BLOCK:
             return np.vstack([self._features(X[start : start + _BLOCK]) for start in range(0, len(X), _BLOCK)])
-        return self._links.gravity(X[:, : self._layout.n_joints])[:, self._columns] * self._signs
+        q = self._with_offsets(X)[:, : self._layout.n_joints]
+        return self._links.gravity(q)[:, self._columns] * self._signs
 
     def _jacobian(self, X: np.ndarray) -> np.ndarray:
         if self.robot is None:
             return same_for_all(np.eye(X.shape[1]), len(X))
         n, columns = self._layout.n_joints, self._columns
         jacobian = np.zeros((len(X), len(columns), X.shape[1]))
+        X = self._with_offsets(X)
         for start in range(0, len(X), _BLOCK):
             rows = slice(start, start + _BLOCK)
             by_q = self._links.gravity_jacobian(X[rows, :n])[:, columns]
             jacobian[rows, :, :n] = by_q * self._signs[:, np.newaxis]
         return jacobian
+
+    def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
+        return self._by_offsets(self._jacobian(X))
 
     def _names(self, columns: np.ndarray) -> list[str]:
         if self.robot is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
@@ -15,8 +15,9 @@ from ..robots.loading import Robot, named_system, read_once
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
 from ..utils.validation import as_floats
-from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
+from .gravity import GravityMap, LinkGravity, OffsetAngles, SineGravity, links_under_gravity
 from .robot_map import STEP, RobotMap, VelocityPrior
+from .theta import Prior
 
 
 class _NewtonFeatures(RobotMap):
@@ -186,7 +187,7 @@ class InertiaForce(_NewtonFeatures):
         return list(columns)
 
 
-class InertiaForceGravity(_NewtonFeatures):
+class InertiaForceGravity(OffsetAngles, _NewtonFeatures):
     r"""Inertia + force + gravity features (IFG): those of `InertiaForce` and the pull of gravity on each link.
 
     For a planar system of the paper :math:`h(x) = [q, \dot q, u, \sin(\cdot)]` (its eq. gravity_prior and section
@@ -230,9 +231,16 @@ class InertiaForceGravity(_NewtonFeatures):
     other_ratio : float, default=0.003
         Prior standard deviation of what all other features contribute, as a multiple of the same change. These weights
         are 0 in Newton's law, or the 1 of a position for itself. With 0 they stay at their mean.
+    parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
+        Priors of unknown offsets of angles in rad, such as ``{"offset(q)": Normal(0.0, 0.05)}`` for the position ``q``.
+        Gravity is computed for the angle in X plus the offset: the zero error of an encoder. Each position of a
+        revolute joint may have one. The regressor learns their values. If None, angles are as in X.
 
     Attributes
     ----------
+    theta_ : dict of str to float
+        Offsets that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
+        ``feature_map_`` of a fitted regressor, they are those of the posterior.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
@@ -297,6 +305,7 @@ class InertiaForceGravity(_NewtonFeatures):
         unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         other_ratio: float = 0.003,
+        parameters: Mapping[str, Prior] | None = None,
     ):
         self.robot = robot
         self.dt = dt
@@ -309,8 +318,10 @@ class InertiaForceGravity(_NewtonFeatures):
         self.unknown_ratio = unknown_ratio
         self.coupling_ratio = coupling_ratio
         self.other_ratio = other_ratio
+        self.parameters = parameters
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **OffsetAngles._parameter_constraints,
         **_NewtonFeatures._parameter_constraints,
         "gravity": [LinkGravity, None],
         "gravity_gain": [Real, "array-like"],
@@ -324,9 +335,9 @@ class InertiaForceGravity(_NewtonFeatures):
         """Return the fitted features of gravity."""
         if self.gravity is not None:
             features = clone(self.gravity)
-            if features.outputs is not None or features.dt is not None:
-                left = "outputs" if features.outputs is not None else "dt"
-                raise ValueError(f"gravity={self.gravity!r} must leave {left} to {type(self).__name__}.")
+            for name in ("outputs", "dt", "parameters"):
+                if getattr(features, name) is not None:
+                    raise ValueError(f"gravity={self.gravity!r} must leave {name} to {type(self).__name__}.")
             if features.robot is None:
                 features.robot = robot
         elif robot is None or ((system := named_system(robot)) is not None and system.gravity):
@@ -342,14 +353,20 @@ class InertiaForceGravity(_NewtonFeatures):
         return features.fit(np.zeros((1, n_columns)))
 
     def _features(self, X: np.ndarray) -> np.ndarray:
-        return np.concatenate((X, self._gravity._features(X)), axis=1)
+        return np.concatenate((X, self._gravity._features(self._with_offsets(X))), axis=1)
 
     def _jacobian(self, X: np.ndarray) -> np.ndarray:
-        of_gravity, d = self._gravity._jacobian(X), X.shape[1]
+        of_gravity, d = self._gravity._jacobian(self._with_offsets(X)), X.shape[1]
         jacobian = np.empty((len(X), d + of_gravity.shape[1], d))
         jacobian[:, :d] = np.eye(d)
         jacobian[:, d:] = of_gravity
         return jacobian
+
+    def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
+        # X itself is measured, and does not depend on the offsets.
+        by_offsets = self._by_offsets(self._jacobian(X))
+        by_offsets[:, : X.shape[1]] = 0.0
+        return by_offsets
 
     def _names(self, columns: np.ndarray) -> list[str]:
         return [*columns, *self._gravity._names(columns)]

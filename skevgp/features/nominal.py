@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
@@ -12,7 +12,8 @@ from ..robots import Layout, RigidBody
 from ..robots.loading import Robot, known_robot
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
-from .robot_map import STEP, RobotMap, VelocityPrior
+from .robot_map import STEP, ParametricMap, RobotMap, VelocityPrior
+from .theta import Prior
 
 _NAMES = {
     "acceleration": "acc({})",
@@ -20,9 +21,13 @@ _NAMES = {
     "bias": "bias torque({})",
     "input": "acc by u({})",
 }
+# Kinds of parameters. A link's name may stand for its joint in the first ones.
+_OF_LINKS, _OF_JOINTS = ("mass", "length", "inertia"), ("damping", "armature")
+# Share of a factor by which differences move it.
+_MOVE = 0.5
 
 
-class NominalDynamics(RobotMap):
+class NominalDynamics(ParametricMap, RobotMap):
     r"""Features from an approximate model of the robot, such as a URDF with inaccurate masses and no friction.
 
     The model's equation of motion is
@@ -58,9 +63,26 @@ class NominalDynamics(RobotMap):
         multiple of the change that the prior mean of all features leaves.
     other_ratio : float, default=0.03
         The same for all other weights, whose mean is 0. With 0 they stay 0.
+    parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
+        Priors of unknown factors on numbers of the model, such as ``{"mass(elbow)": LogNormal(1.0, 0.2)}``. The
+        regressor learns the factors. With a factor of 1 a number is that of the model. If None, the model is used as it
+        is. For each joint there are these factors, as far as the model's number is not 0:
+
+        - ``"mass(joint)"``: mass and rotational inertia of the link that the joint moves, which keeps its shape;
+        - ``"length(joint)"``: size of this link. It multiplies the distances from the joint to the link's centre of
+          mass and to the next joints, and its square multiplies the rotational inertia. The mass stays the same;
+        - ``"inertia(joint)"``: rotational inertia of this link about its centre of mass;
+        - ``"damping(joint)"``: viscous damping of the joint;
+        - ``"armature(joint)"``: reflected inertia of the rotor.
+
+        All bodies that are fixed to each other are one link. In the first three names, the name of any of them may
+        stand for the joint. Frames of bodies that do not move have no parameters.
 
     Attributes
     ----------
+    theta_ : dict of str to float
+        Factors that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
+        ``feature_map_`` of a fitted regressor, they are those of the posterior.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
@@ -107,6 +129,13 @@ class NominalDynamics(RobotMap):
            [0.0408]])
     >>> logged.get_feature_names_out().tolist()
     ['dt * acc(q)']
+
+    A cartpole whose pole has an unknown length:
+
+    >>> from skevgp.features import LogNormal
+    >>> cartpole = NominalDynamics("cartpole", parameters={"length(theta)": LogNormal(1.0, 0.2)})
+    >>> cartpole.fit([[0.0, 0.1, 0.0, 0.0, 1.0]]).theta_
+    {'length(theta)': 1.0}
     """
 
     def __init__(
@@ -119,6 +148,7 @@ class NominalDynamics(RobotMap):
         model_error: float = 0.3,
         unknown_ratio: float = 1.0,
         other_ratio: float = 0.03,
+        parameters: Mapping[str, Prior] | None = None,
     ):
         self.robot = robot
         self.terms = terms
@@ -127,8 +157,10 @@ class NominalDynamics(RobotMap):
         self.model_error = model_error
         self.unknown_ratio = unknown_ratio
         self.other_ratio = other_ratio
+        self.parameters = parameters
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **ParametricMap._parameter_constraints,
         **RobotMap._parameter_constraints,
         "terms": ["array-like"],
         "dt": [Interval(Real, 0, None, closed="neither"), StrOptions({"column"})],
@@ -137,12 +169,17 @@ class NominalDynamics(RobotMap):
         "other_ratio": [Interval(Real, 0, None, closed="left")],
     }
 
+    # The robot without factors, if there are parameters, and with more and with less of each parameter.
+    _given: RigidBody | None
+    _moved: list[tuple[RigidBody, RigidBody, float]] | None
+
     def _prepare(self, robot: Robot | None) -> None:
         self._check_terms()
         self._terms = tuple(self.terms)
         if robot is None:
             return
         self._body = RigidBody(known_robot(robot))
+        self._given = self._body if self.parameters else None
         # A massless tip makes the mass matrix singular in nearly every configuration. This row raises the error early.
         self._features(np.random.RandomState(0).uniform(-1.0, 1.0, (1, self._layout.n_columns)))
 
@@ -180,6 +217,103 @@ class NominalDynamics(RobotMap):
             "input": lambda: body.accelerations_by_force_jacobian(q, u),
         }
         jacobian = np.concatenate([blocks[term]() for term in self._terms], axis=1)
+        self._check_finite(jacobian, q)
+        return jacobian
+
+    # --- parameters ---------------------------------------------------------------------------------------------------
+
+    def _model(self) -> Any:
+        """Return the model without factors."""
+        return (self._given or self._body).model
+
+    def _allowed_parameters(self) -> dict[str, tuple[str, list[int]]]:
+        model, n = self._model(), self._layout.n_joints
+        links = list(model.inertias)[1:]
+        lengths = [np.linalg.norm(link.lever) + np.linalg.norm(link.inertia) for link in links]
+        for number, parent in enumerate(list(model.parents)[1:], start=1):
+            if parent > 0:
+                lengths[parent - 1] += np.linalg.norm(model.jointPlacements[number].translation)
+        sizes = {
+            "mass": [link.mass for link in links],
+            "length": lengths,
+            "inertia": [np.linalg.norm(link.inertia) for link in links],
+            "damping": list(model.damping),
+            "armature": list(model.armature),
+        }
+        allowed: dict[str, tuple[str, list[int]]] = {}
+        for kind, numbers in sizes.items():
+            allowed |= self._one_per_joint([kind], [joint for joint in range(n) if numbers[joint] > 0.0])
+        return allowed
+
+    def _synonym(self, name: str) -> str:
+        kind, _, owner = name.removesuffix(")").partition("(")
+        joints = list(self._model().names)[1:]
+        if kind not in _OF_LINKS or owner in joints or not name.endswith(")"):
+            return name
+        for frame in self._model().frames:
+            if frame.name == owner and frame.type.name == "BODY" and frame.parentJoint > 0:
+                return f"{kind}({joints[frame.parentJoint - 1]})"
+        return name
+
+    def _factors(self) -> dict[str, list[Any]]:
+        """Return a factor for each joint, of each kind."""
+        return {kind: self._at_theta(kind, [1.0] * self._layout.n_joints) for kind in (*_OF_LINKS, *_OF_JOINTS)}
+
+    def _store_theta(self) -> None:
+        self._body = RigidBody(_multiplied(self._model(), self._factors()))
+        self._moved = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The moved models follow from the others.
+        state = super().__getstate__()
+        return {**state, "_moved": None} if "_moved" in state else state
+
+    def _bodies_around(self) -> list[tuple[RigidBody, RigidBody, float]]:
+        """Return the robot with more and with less of each parameter, and the difference of the parameter."""
+        if self._moved is None:
+            factors, moved = self._factors(), []
+            for name, (kind, joints) in self._targets.items():
+                more, less = (
+                    {
+                        **factors,
+                        kind: [share * own if joint in joints else own for joint, own in enumerate(factors[kind])],
+                    }
+                    for share in (1.0 + _MOVE, 1.0 - _MOVE)
+                )
+                bodies = [RigidBody(_multiplied(self._model(), own)) for own in (more, less)]
+                moved.append((bodies[0], bodies[1], 2.0 * _MOVE * self.theta_[name]))
+            self._moved = moved
+        return self._moved
+
+    def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
+        # Joint forces are polynomials of degree 2 in each factor, so that central differences of them are exact for any
+        # step. For given forces, M(q) dq̈/dθ is minus the derivative of the forces that q̈ needs.
+        n = self._layout.n_joints
+        q, v, u = X[:, :n], X[:, n : 2 * n], X[:, 2 * n :]
+        body, still = self._body, np.zeros_like(v)
+        reached: dict[str, np.ndarray] = {}
+        if "acceleration" in self._terms:
+            reached["acceleration"] = body.accelerations_under(q, v, u)
+        if "input" in self._terms:
+            reached["input"] = body.accelerations_by_force(q, body.joint_forces(u))
+        forces: dict[str, Callable[[RigidBody], np.ndarray]] = {
+            "acceleration": lambda moved: moved.forces_under_damping(q, v, reached["acceleration"]),
+            "gravity": lambda moved: moved.gravity(q),
+            "bias": lambda moved: moved.forces(q, v, still),
+            "input": lambda moved: moved.inertial_forces(q, reached["input"]),
+        }
+        columns = []
+        for more, less, width in self._bodies_around():
+            slopes = [(forces[term](more) - forces[term](less)) / width for term in self._terms]
+            columns.append(
+                np.hstack(
+                    [
+                        -body.accelerations_by_force(q, slope) if term in reached else slope
+                        for term, slope in zip(self._terms, slopes, strict=True)
+                    ]
+                )
+            )
+        jacobian = np.stack(columns, axis=-1)
         self._check_finite(jacobian, q)
         return jacobian
 
@@ -230,3 +364,19 @@ class NominalDynamics(RobotMap):
                 block.set_rate(np.eye(n, dtype=bool), self.model_error, "model")
             prior = prior.beside(block)
         return prior
+
+
+def _multiplied(model: Any, factors: Mapping[str, Sequence[float]]) -> Any:
+    """Return a copy of a model with numbers multiplied by factors, one for each joint."""
+    model = model.copy()
+    of_links = zip(*(factors[kind] for kind in _OF_LINKS), strict=True)
+    for number, (mass, length, inertia) in enumerate(of_links, start=1):
+        link, parent = model.inertias[number], model.parents[number]
+        link.inertia = mass * length**2 * inertia * link.inertia
+        link.mass, link.lever = mass * link.mass, length * link.lever
+        if parent > 0:
+            place = model.jointPlacements[number]
+            place.translation = factors["length"][parent - 1] * place.translation
+    model.damping = np.array(model.damping) * factors["damping"]
+    model.armature = np.array(model.armature) * factors["armature"]
+    return model

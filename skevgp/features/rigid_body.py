@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, ClassVar
 
@@ -14,8 +14,8 @@ from ..robots import RigidBody, load_robot
 from ..robots.loading import Robot, effort_limits, known_robot
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval
-from ..utils.validation import as_floats
-from .robot_map import RobotTransformer, has_robot
+from .robot_map import ParametricMap, has_robot, one_per_joint
+from .theta import Prior
 
 FRICTION = ("viscous", "coulomb", "offset", "armature")
 _INERTIAL = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
@@ -27,7 +27,7 @@ _SPEED, _ACCELERATION = 1.0, 10.0
 _STEP = 1e-3
 
 
-class RigidBodyRegressor(RobotTransformer):
+class RigidBodyRegressor(ParametricMap):
     r"""Features of inverse dynamics: the torques of all joints are linear in one set of weights.
 
     A robot's equation of motion with friction is
@@ -58,9 +58,17 @@ class RigidBodyRegressor(RobotTransformer):
     friction_scale : float, default=0.3
         Prior standard deviation of Coulomb friction and offset, as a share of the largest torque of the motor. It is
         also that of viscous friction at 1 rad/s and of the rotor's torque at 10 rad/s².
+    parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
+        Priors of unknown velocities v_s, instead of ``stiction_velocity``. Names are ``"stiction_velocity"`` for one of
+        all joints, or the joint's in brackets, such as ``{"stiction_velocity(elbow)": LogNormal(0.01, 1.0)}``. The
+        regressor learns their values. If None, they are as in ``stiction_velocity``. `skevgp.InverseDynamics` finds
+        them without parameters.
 
     Attributes
     ----------
+    theta_ : dict of str to float
+        Velocities that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
+        ``feature_map_`` of a fitted regressor, they are those of the posterior.
     share_coef : bool
         Whether all outputs have the same weights. True if there is a robot.
     model_ : pinocchio.Model
@@ -103,6 +111,13 @@ class RigidBodyRegressor(RobotTransformer):
     array([[2.9516]])
     >>> body.get_feature_names_out()[[0, -1]].tolist()
     ['m(q)', 'viscous(q)']
+
+    Learn the velocity within which Coulomb friction changes its sign:
+
+    >>> from skevgp.features import LogNormal
+    >>> body = RigidBodyRegressor("pendulum", parameters={"stiction_velocity": LogNormal(0.01, 1.0)})
+    >>> body.fit([[0.5, 1.0, 2.0]]).theta_
+    {'stiction_velocity': 0.01}
     """
 
     def __init__(
@@ -115,6 +130,7 @@ class RigidBodyRegressor(RobotTransformer):
         com_scale: float = 0.2,
         inertia_scale: float = 0.3,
         friction_scale: float = 0.3,
+        parameters: Mapping[str, Prior] | None = None,
     ):
         self.robot = robot
         self.friction = friction
@@ -123,9 +139,10 @@ class RigidBodyRegressor(RobotTransformer):
         self.com_scale = com_scale
         self.inertia_scale = inertia_scale
         self.friction_scale = friction_scale
+        self.parameters = parameters
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
-        **RobotTransformer._parameter_constraints,
+        **ParametricMap._parameter_constraints,
         "friction": ["array-like"],
         "stiction_velocity": [Interval(Real, 0, None, closed="neither"), "array-like"],
         "mass_scale": [Interval(Real, 0, None, closed="left")],
@@ -154,14 +171,24 @@ class RigidBodyRegressor(RobotTransformer):
             self._body = RigidBody(self.model_)
 
     def _checked_velocity(self) -> np.ndarray:
-        velocity = as_floats(self.stiction_velocity, "stiction_velocity")
         n_joints = 1 if self.robot is None else self._layout.n_joints
-        if velocity.shape not in ((), (n_joints,)) or not (np.isfinite(velocity) & (velocity > 0.0)).all():
-            raise ValueError(
-                f"stiction_velocity={self.stiction_velocity!r} must be a number above 0, or one for each of the "
-                f"{n_joints} joints."
-            )
-        return velocity
+        return one_per_joint(self.stiction_velocity, "stiction_velocity", n_joints)
+
+    def _allowed_parameters(self) -> dict[str, tuple[str, list[int]]]:
+        if "coulomb" not in self._terms:
+            return {}
+        joints = list(range(self._layout.n_joints))
+        return {
+            "stiction_velocity": ("stiction_velocity", joints),
+            **self._one_per_joint(["stiction_velocity"], joints),
+        }
+
+    def _store_theta(self) -> None:
+        given = np.broadcast_to(self._checked_velocity(), self._layout.n_joints)
+        self._velocity = np.array(self._at_theta("stiction_velocity", given))
+
+    def _unit(self, kind: str, joints: list[int]) -> str:
+        return self._speed_unit(joints)
 
     def _checked_friction(self) -> tuple[str, ...]:
         terms = [term for term in self.friction if isinstance(term, str) and term in FRICTION]
@@ -215,6 +242,17 @@ class RigidBodyRegressor(RobotTransformer):
                 feature = width + number * n_joints + joint
                 jacobian[:, joint, feature, n_joints + joint] = by_v[term][:, joint]
                 jacobian[:, joint, feature, 2 * n_joints + joint] = float(term == "armature")
+        return jacobian
+
+    def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
+        v = np.split(X, 3, axis=1)[1]
+        (n, n_joints), first = v.shape, (10 + self._terms.index("coulomb")) * v.shape[1]
+        # d tanh(v / v_s) / d v_s
+        slope = (np.tanh(v / self._velocity) ** 2 - 1.0) * v / self._velocity**2
+        jacobian = np.zeros((n, n_joints, (10 + len(self._terms)) * n_joints, len(self._targets)))
+        for number, (_, joints) in enumerate(self._targets.values()):
+            for joint in joints:
+                jacobian[:, joint, first + joint, number] = slope[:, joint]
         return jacobian
 
     def _names(self, columns: np.ndarray) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
@@ -18,7 +18,8 @@ from ..robots import Layout, layout_of
 from ..robots.loading import Robot, read_once
 from ..utils.sklearn import check_feature_names_in, fit_context
 from ..utils.state import StatefulEstimator
-from ..utils.validation import is_plain
+from ..utils.validation import as_floats, is_plain
+from .theta import Prior, check_prior, is_positive
 
 # Default time step, s.
 STEP = 0.03
@@ -55,6 +56,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
     dt: float | Literal["column"] | None = None
     _timed = False  # whether rows ended with their time step in the last fit
     _n_blocks: ClassVar[int] = 2  # number of blocks with one column per joint: [q, q̇]
+    _begins_with_state: ClassVar[bool] = False
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
@@ -97,6 +99,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
             self._check_steps(rows)
             self._mean_step = float(rows[:, -1].mean()) if self._timed else None
         self._prepare(robot)
+        self._prepare_parameters()
         return self
 
     def _takes_steps(self) -> bool:
@@ -210,6 +213,13 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
     def _prepare(self, robot: Robot | None) -> None:
         """Store data of the robot at `fit`, besides the layout; the base class stores nothing."""
 
+    def _prepare_parameters(self) -> None:
+        """Set the parameters at the end of `fit`; only subclasses of `ParametricMap` have some."""
+
+    def _n_kept(self, layout: Layout) -> int:
+        """Number of columns of the state before the features that are multiplied by Δt."""
+        return 2 * layout.n_joints if self._begins_with_state else 0
+
     def _values(self, X: np.ndarray) -> np.ndarray:
         """Return the result of `transform` for validated rows."""
         return self._features(X)
@@ -247,7 +257,151 @@ def _steps_of(X: np.ndarray) -> np.ndarray:
     return dt
 
 
-def has_robot(transformer: RobotMap) -> bool:
+class ParametricMap(RobotTransformer):
+    """A map of a robot with parameters θ that a regressor learns, if it is given some (see `features.theta`).
+
+    A parameter belongs to a kind, such as "mass", and to some joints. A subclass defines `_allowed_parameters` and
+    `_theta_derivatives`, and takes the values at ``theta_`` from `_at_theta`.
+    """
+
+    parameters: Mapping[str, Prior] | None
+    # Kinds whose values may be 0 or negative.
+    _signed: ClassVar[tuple[str, ...]] = ()
+    # Kind and joints of each parameter.
+    _targets: dict[str, tuple[str, list[int]]]
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **RobotTransformer._parameter_constraints,
+        "parameters": [dict, None],
+    }
+
+    def theta_prior(self) -> dict[str, Prior]:
+        """Return the prior of each parameter.
+
+        Returns
+        -------
+        priors : dict of str to prior
+            The argument ``parameters``. Empty if the map has no parameters.
+        """
+        return dict(self.parameters or {})
+
+    def set_theta(self, theta: Mapping[str, float]) -> None:
+        """Set the parameters.
+
+        Parameters
+        ----------
+        theta : dict of str to float
+            Value of each parameter.
+        """
+        self.theta_ = {name: float(theta[name]) for name in self._targets}
+        self._store_theta()
+
+    def theta_jacobian(self, X: np.ndarray) -> np.ndarray:
+        """Differentiate the features in the parameters at ``theta_``.
+
+        Parameters
+        ----------
+        X : ndarray of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
+
+        Returns
+        -------
+        jacobian : ndarray of the shape of the features, and (n_theta,)
+            ∂h/∂θ, in the order of ``parameters``.
+        """
+        X = np.asarray(X, dtype=np.float64)
+        if not self._timed:
+            return self._theta_derivatives(X)
+        x, dt, n_kept = X[:, :-1], _steps_of(X), self._n_kept(self._layout)
+        inner = self._theta_derivatives(x)
+        jacobian = np.zeros((len(X), n_kept + inner.shape[1], inner.shape[2]))
+        jacobian[:, n_kept:] = dt[:, :, np.newaxis] * inner
+        return jacobian
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the parameters, for `summary`."""
+        return {name: self._unit(kind, joints) for name, (kind, joints) in self._targets.items()}
+
+    def _prepare_parameters(self) -> None:
+        self._targets = self._checked_parameters()
+        if self._targets:
+            self.set_theta({name: prior.value(0.0) for name, prior in self.theta_prior().items()})
+        elif hasattr(self, "theta_"):
+            del self.theta_
+
+    def _checked_parameters(self) -> dict[str, tuple[str, list[int]]]:
+        """Return the kind and the joints of each parameter."""
+        priors = self.theta_prior()
+        if priors and self.robot is None:
+            raise ValueError(f"parameters={list(priors)} of {type(self).__name__} need a robot.")
+        allowed = self._allowed_parameters() if priors else {}
+        targets: dict[str, tuple[str, list[int]]] = {}
+        for name, prior in priors.items():
+            known = self._synonym(name)
+            if known not in allowed:
+                raise ValueError(
+                    f"{type(self).__name__} of the robot {self._layout.name!r} has no parameter {name!r}. The "
+                    f"parameters that it can have are {list(allowed)}."
+                )
+            check_prior(prior, name)
+            kind, joints = allowed[known]
+            if kind not in self._signed and not is_positive(prior):
+                raise ValueError(
+                    f"The parameter {name!r} must be above 0, but its prior {prior!r} also allows other values. Use "
+                    "LogNormal(median, sigma), or Uniform(low, high) with low=0 or above."
+                )
+            for other, (its_kind, its_joints) in targets.items():
+                if kind == its_kind and set(joints) & set(its_joints):
+                    raise ValueError(f"The parameters {other!r} and {name!r} are for the same joint: leave one out.")
+            targets[name] = kind, joints
+        return targets
+
+    def _at_theta(self, kind: str, default: Iterable[Any]) -> list[Any]:
+        """Return the values of a kind of parameters for each joint, given those without parameters."""
+        values = list(default)
+        for name, (own, joints) in self._targets.items():
+            for joint in joints if own == kind else ():
+                values[joint] = self.theta_[name]
+        return values
+
+    def _synonym(self, name: str) -> str:
+        """Return the name in `_allowed_parameters` for a parameter's name."""
+        return name
+
+    def _allowed_parameters(self) -> dict[str, tuple[str, list[int]]]:
+        """Return the names of all possible parameters, with their kind and joints."""
+        raise NotImplementedError
+
+    def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
+        """Return the derivatives of `_features` in the parameters."""
+        raise NotImplementedError
+
+    def _store_theta(self) -> None:
+        """Store what depends on ``theta_``."""
+
+    def _unit(self, kind: str, joints: list[int]) -> str:
+        return ""
+
+    def _one_per_joint(self, kinds: Iterable[str], joints: Iterable[int]) -> dict[str, tuple[str, list[int]]]:
+        """Return a parameter of each kind for each joint."""
+        names, joints = self._layout.position_names, list(joints)
+        return {f"{kind}({names[joint]})": (kind, [joint]) for kind in kinds for joint in joints}
+
+    def _speed_unit(self, joints: list[int]) -> str:
+        units = {"rad/s" if self._layout.revolute[joint] else "m/s" for joint in joints}
+        return units.pop() if len(units) == 1 else ""
+
+
+def one_per_joint(value: ArrayLike, name: str, n_joints: int) -> np.ndarray:
+    """Return positive numbers, () for all joints or (n_joints,), or raise a ValueError."""
+    values = as_floats(value, name)
+    if values.shape not in ((), (n_joints,)) or not (np.isfinite(values) & (values > 0.0)).all():
+        raise ValueError(f"{name}={value!r} must be a number above 0, or one for each of the {n_joints} joints.")
+    return values
+
+
+def has_robot(transformer: RobotTransformer) -> bool:
     if transformer.robot is None:
         raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
     return True
@@ -292,7 +446,6 @@ class RobotMap(RobotTransformer):
     """
 
     outputs: Sequence[int | str] | None
-    _begins_with_state: ClassVar[bool] = False
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotTransformer._parameter_constraints,
@@ -429,10 +582,6 @@ class RobotMap(RobotTransformer):
     def _velocity_prior(self, layout: Layout) -> VelocityPrior:
         """Return the prior standard deviations of the weights for velocities; works before `fit`."""
         raise NotImplementedError
-
-    def _n_kept(self, layout: Layout) -> int:
-        """Number of columns of the state before the features that are multiplied by Δt."""
-        return 2 * layout.n_joints if self._begins_with_state else 0
 
     def _values(self, X: np.ndarray) -> np.ndarray:
         if not self._timed:

@@ -205,6 +205,11 @@ class Uniform(Prior):
         return float(np.clip(ndtri((value - self.low) / (self.high - self.low)), -_FARTHEST, _FARTHEST))
 
 
+def is_positive(prior: Prior) -> bool:
+    """Whether a prior keeps its parameter above 0."""
+    return prior.value(-_FARTHEST) > 0.0
+
+
 def check_prior(prior: object, name: str) -> None:
     """Raise a TypeError if a parameter has no prior."""
     if not isinstance(prior, Prior):

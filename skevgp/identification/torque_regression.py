@@ -118,6 +118,11 @@ class TorqueRegression(StatefulEstimator):
 
     def _map(self) -> RigidBodyRegressor:
         if isinstance(self.robot, RigidBodyRegressor):
+            if self.robot.parameters:
+                raise ValueError(
+                    f'{type(self).__name__} finds stiction velocities itself, by stiction_velocity="auto": leave the '
+                    f"parameters of RigidBodyRegressor at None; got {list(self.robot.parameters)}."
+                )
             return clone(self.robot)
         return RigidBodyRegressor(self.robot)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
-from ..features.gravity import SineGravity
+from ..features import AngleEncoder, Friction, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
+from ..features.friction import LARGEST_POWER, SMALLEST_RATIO
+from ..features.gravity import OffsetAngles, SineGravity
 from ..features.robot_map import RobotTransformer
 from ..robots.loading import joint_axes
 from ..utils.casadi import casadi
@@ -80,10 +83,20 @@ class Newton(_OfRobot):
 class NewtonGravity(_OfRobot):
     """The row itself with the features of gravity."""
 
+    # Whether `casadi` takes the parameters from ``theta_`` as symbols.
+    symbolic_theta = True
+
     def features(self, x: Any) -> Any:
-        gravity = self.transformer._gravity
-        of_gravity = _sines(gravity, x) if type(gravity) is SineGravity else as_map(gravity).casadi(x)
+        gravity, shifted = self.transformer._gravity, _with_offsets(self.transformer, x)
+        of_gravity = _sines(gravity, shifted) if type(gravity) is SineGravity else as_map(gravity).casadi(shifted)
         return casadi().vertcat(x, of_gravity)
+
+
+def _with_offsets(features: OffsetAngles, x: Any) -> Any:
+    if not features._targets:
+        return x
+    n = features._layout.n_joints
+    return casadi().vertcat(x[:n] + casadi().vertcat(*features._at_theta("offset", [0.0] * n)), x[n:])
 
 
 def _sines(gravity: SineGravity, x: Any) -> Any:
@@ -97,9 +110,12 @@ def _sines(gravity: SineGravity, x: Any) -> Any:
 class GravityOfLinks(_OfRobot):
     """Gravity in the frame of each link, computed from its parent's as in `LinkGravity`."""
 
+    symbolic_theta = True
+
     def features(self, x: Any) -> Any:
         if self.transformer.robot is None:
             return x
+        x = _with_offsets(self.transformer, x)
         ca, links = casadi(), self.transformer._links
         weights: list[Any] = []
         for i, parent in enumerate(links._parents):
@@ -113,15 +129,40 @@ class GravityOfLinks(_OfRobot):
         return chosen(ca.horzcat(*weights).T, self.transformer._columns) * ca.DM(self.transformer._signs)
 
 
+@adapts(Friction)
+class FrictionOfJoints(_OfRobot):
+    """Friction as a function of velocities."""
+
+    symbolic_theta = True
+
+    def features(self, x: Any) -> Any:
+        friction = self.transformer
+        if friction.robot is None:
+            return x
+        ca, n = casadi(), friction._layout.n_joints
+        v = x[n : 2 * n]
+        number = {name: ca.vertcat(*values) for name, values in friction._numbers_of_joints().items()}
+        tanh = ca.tanh(v / number["stiction_velocity"])
+        ratio = ca.fmax(ca.fabs(v) / number["stribeck_velocity"], SMALLEST_RATIO)
+        power = ca.fmin(ratio ** number["sharpness"], LARGEST_POWER)
+        values = {"viscous": v, "coulomb": tanh, "stribeck": tanh * ca.exp(-power)}
+        return ca.vertcat(*(values[term] for term in friction._terms))
+
+
 @adapts(NominalDynamics)
 class Nominal(_OfRobot):
     """Accelerations and torques of a rigid-body model."""
 
+    symbolic_theta = True
+
     def features(self, x: Any) -> Any:
         if self.transformer.robot is None:
             return x
-        ca, layout = casadi(), self.transformer._layout
-        n, body = layout.n_joints, SymbolicRigidBody(self.transformer._body.model)
+        ca, layout, theta = casadi(), self.transformer._layout, getattr(self.transformer, "theta_", {})
+        n, symbols = layout.n_joints, ca.MX.sym("theta", len(theta))
+        nominal = copy(self.transformer)
+        nominal.theta_ = {name: symbols[i] for i, name in enumerate(theta)}
+        body = SymbolicRigidBody(nominal._model(), nominal._factors())
         row = ca.MX.sym("x", x.numel())
         q, v = row[:n], row[n : 2 * n]
         force = ca.MX.zeros(n, 1)
@@ -134,7 +175,8 @@ class Nominal(_OfRobot):
         }
         found = ca.vertcat(*(terms[term]() for term in self.transformer._terms))
         # As a function of scalars it takes a tenth of the time of 6 x 6 matrices.
-        return ca.Function("nominal_dynamics", [row], [found]).expand()(x)
+        function = ca.Function("nominal_dynamics", [row, symbols], [found]).expand()
+        return function(x, ca.vertcat(*theta.values()) if theta else ca.DM(0, 1))
 
 
 # --- rigid-body dynamics ---------------------------------------------------------------------------------------------
@@ -142,6 +184,7 @@ class Nominal(_OfRobot):
 # Pinocchio's: linear part first, in the frame of their joint.
 
 _KNOWN = ("JointModelR", "JointModelP")
+_FACTORS = ("mass", "length", "inertia", "damping", "armature")
 
 
 @dataclass(frozen=True)
@@ -151,28 +194,33 @@ class _Joint:
     parent: int  # -1 is the base
     axis: np.ndarray  # (6,): motion per unit of velocity
     # (6, 6) each: fixed + sine sin q + cosine cos q + linear q turns a motion in the parent's frame into this frame.
-    fixed: np.ndarray
-    sine: np.ndarray
-    cosine: np.ndarray
-    linear: np.ndarray
-    inertia: np.ndarray  # (6, 6)
-    armature: float
+    # Numbers and symbols of CasADi.
+    fixed: Any
+    sine: Any
+    cosine: Any
+    linear: Any
+    inertia: Any  # (6, 6)
+    armature: Any
 
     def transform(self, q: Any) -> Any:
         """Return the transform of motions from the parent's frame to this one; its transpose takes forces back."""
         ca = casadi()
         if self.axis[3:].any():
-            return ca.DM(self.fixed) + ca.sin(q) * ca.DM(self.sine) + ca.cos(q) * ca.DM(self.cosine)
-        return ca.DM(self.fixed) + q * ca.DM(self.linear)
+            return self.fixed + ca.sin(q) * self.sine + ca.cos(q) * self.cosine
+        return self.fixed + q * self.linear
 
 
 class SymbolicRigidBody:
-    """The functions of `skevgp.robots.RigidBody` for one symbolic state; joints must be revolute or prismatic."""
+    """The functions of `skevgp.robots.RigidBody` for one symbolic state; joints must be revolute or prismatic.
 
-    def __init__(self, model: Any):
-        self._joints = _joints_of(model)
+    ``factors`` holds a number or symbol of each kind for each joint, as in `NominalDynamics`.
+    """
+
+    def __init__(self, model: Any, factors: Mapping[str, Sequence[Any]] | None = None):
+        factors = factors or dict.fromkeys(_FACTORS, [1.0] * model.nv)
+        self._joints = _joints_of(model, factors)
         self._gravity = np.array(model.gravity.vector, dtype=float)
-        self._damping = np.array(model.damping, dtype=float)
+        self._damping = [own * damping for own, damping in zip(factors["damping"], model.damping.tolist(), strict=True)]
 
     def forces(self, q: Any, v: Any, a: Any, gravity: bool = True) -> Any:
         """Return τ = M(q) a + C(q, v) v + g(q) by the recursive Newton-Euler algorithm; v and a may be None for 0."""
@@ -186,7 +234,7 @@ class SymbolicRigidBody:
             )
             own = ca.mtimes(transforms[i], before) + biases[i]
             accelerations.append(own if a is None else own + ca.DM(joint.axis) * a[i])
-            forces.append(ca.mtimes(ca.DM(joint.inertia), accelerations[i]) + self._gyroscopic(i, motions[i]))
+            forces.append(ca.mtimes(joint.inertia, accelerations[i]) + self._gyroscopic(i, motions[i]))
         found = [None] * len(self._joints)
         for i, joint in reversed(list(enumerate(self._joints))):
             found[i] = ca.dot(ca.DM(joint.axis), forces[i])
@@ -204,7 +252,7 @@ class SymbolicRigidBody:
         """Return q̈ = M(q)⁻¹ (τ - C(q, v) v - g(q)) by the articulated-body algorithm; v may be None for zeros."""
         ca = casadi()
         transforms, motions, biases = self._kinematics(q, v)
-        inertias = [ca.MX(ca.DM(joint.inertia)) for joint in self._joints]
+        inertias = [ca.MX(joint.inertia) for joint in self._joints]
         forces = [self._gyroscopic(i, motion) for i, motion in enumerate(motions)]
         passed: list[Any] = [None] * len(self._joints)
         for i, joint in reversed(list(enumerate(self._joints))):
@@ -232,7 +280,7 @@ class SymbolicRigidBody:
 
     def accelerations_under(self, q: Any, v: Any, force: Any) -> Any:
         """Return the accelerations under joint forces and the model's viscous damping."""
-        return self.accelerations(q, v, force - casadi().DM(self._damping) * v)
+        return self.accelerations(q, v, force - casadi().vertcat(*self._damping) * v)
 
     def _kinematics(self, q: Any, v: Any) -> tuple[list[Any], list[Any], list[Any]]:
         """Return transforms from the parents, motions of the links, and the accelerations that follow from motion."""
@@ -256,7 +304,7 @@ class SymbolicRigidBody:
         ca = casadi()
         if motion is None:
             return ca.DM.zeros(6)
-        return _cross_force(motion, ca.mtimes(ca.DM(self._joints[i].inertia), motion))
+        return _cross_force(motion, ca.mtimes(self._joints[i].inertia, motion))
 
 
 def _cross_motion(by: Any, motion: Any) -> Any:
@@ -273,7 +321,7 @@ def _cross_force(by: Any, force: Any) -> Any:
     return ca.vertcat(ca.cross(w, force[:3]), ca.cross(w, force[3:]) + ca.cross(v, force[:3]))
 
 
-def _joints_of(model: Any) -> list[_Joint]:
+def _joints_of(model: Any, factors: Mapping[str, Sequence[Any]]) -> list[_Joint]:
     names, joints = list(model.names)[1:], list(model.joints)[1:]
     for name, joint in zip(names, joints, strict=True):
         if not joint.shortname().startswith(_KNOWN) or joint.nq != 1:
@@ -281,31 +329,48 @@ def _joints_of(model: Any) -> list[_Joint]:
                 f"The joint {name!r} of the robot {model.name!r} is of the type {joint.shortname()}; what can be "
                 "exported are revolute and prismatic joints."
             )
-    return [
-        _joint(int(model.parents[i + 1]) - 1, axis, model.jointPlacements[i + 1], model.inertias[i + 1], armature)
-        for i, (axis, armature) in enumerate(zip(joint_axes(model), model.armature, strict=True))
-    ]
+    found = []
+    for i, (axis, armature) in enumerate(zip(joint_axes(model), model.armature.tolist(), strict=True)):
+        parent, inertia = int(model.parents[i + 1]) - 1, model.inertias[i + 1]
+        own = {kind: factors[kind][i] for kind in _FACTORS}
+        length = factors["length"][parent] if parent >= 0 else 1.0
+        placed = _placed(axis, model.jointPlacements[i + 1], length)
+        found.append(_Joint(parent, axis, *placed, _inertia(inertia, own), own["armature"] * armature))
+    return found
 
 
-def _joint(parent: int, axis: np.ndarray, placement: Any, inertia: Any, armature: float) -> _Joint:
-    """Return a joint with its transform R(q) = I + sin q [u] + (1 - cos q) [u]², or its shift by q u."""
-    before, zero = np.array(placement.toActionMatrixInverse()), np.zeros((3, 3))
+def _placed(axis: np.ndarray, placement: Any, length: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the parts of the transform to a joint, R(q) = I + sin q [u] + (1 - cos q) [u]², or its shift by q u."""
+    ca, zero = casadi(), np.zeros((3, 3))
+    # The placement is multiplied by ``length``. The transform of motions is affine in it.
+    whole, turned = np.array(placement.toActionMatrixInverse()), placement.copy()
+    turned.translation = np.zeros(3)
+    without = np.array(turned.toActionMatrixInverse())
     slide, turn = _skew(axis[:3]), _skew(axis[3:])
     both = turn @ turn
     fixed = np.eye(6) + np.block([[both, zero], [zero, both]])
     # In the turned frame a motion is multiplied by R(q)ᵀ; in the shifted frame it is v - q u × w.
     sine, cosine = -np.block([[turn, zero], [zero, turn]]), -np.block([[both, zero], [zero, both]])
     linear = -np.block([[zero, slide], [zero, zero]])
-    return _Joint(
-        parent,
-        axis,
-        fixed @ before,
-        sine @ before,
-        cosine @ before,
-        linear @ before,
-        np.array(inertia.matrix()),
-        float(armature),
-    )
+
+    def placed(part: np.ndarray) -> Any:
+        return ca.DM(part @ without) + length * ca.DM(part @ (whole - without))
+
+    return placed(fixed), placed(sine), placed(cosine), placed(linear)
+
+
+def _inertia(link: Any, factors: Mapping[str, Any]) -> Any:
+    """Return the spatial inertia of a link, multiplied as in `NominalDynamics`."""
+    ca = casadi()
+    whole, own = np.array(link.matrix()), np.zeros((6, 6))
+    own[3:, 3:] = link.inertia
+    by_mass, by_moment, by_square = np.zeros((3, 6, 6))
+    by_mass[:3, :3] = whole[:3, :3]
+    by_moment[:3, 3:], by_moment[3:, :3] = whole[:3, 3:], whole[3:, :3]
+    by_square[3:, 3:] = whole[3:, 3:] - own[3:, 3:]
+    length = factors["length"]
+    turning = ca.DM(by_square) + factors["inertia"] * ca.DM(own)
+    return factors["mass"] * (ca.DM(by_mass) + length * ca.DM(by_moment) + length**2 * turning)
 
 
 def _skew(u: np.ndarray) -> np.ndarray:

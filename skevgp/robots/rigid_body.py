@@ -94,6 +94,14 @@ class RigidBody:
         """
         return self._over_rows("rnea", q, v, a)
 
+    def forces_under_damping(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return B u = M(q)q̈ + C(q, q̇)q̇ + D q̇ + g(q) (n, n_joints), the inverse of `accelerations_under`."""
+        return self.forces(q, v, a) + self._damping * v
+
+    def inertial_forces(self, q: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return M(q)q̈ (n, n_joints), the inverse of `accelerations_by_force`."""
+        return self._without_gravity.forces(q, np.zeros_like(q), a)
+
     def gravity(self, q: np.ndarray) -> np.ndarray:
         """Return g(q) (n, n_joints), the joint forces that hold the robot still at positions q (n, n_joints)."""
         still = np.zeros_like(q)

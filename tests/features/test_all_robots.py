@@ -9,6 +9,7 @@ from numpy.testing import assert_array_equal
 from skevgp.datasets import list_robots, load_robot, make_dynamics
 from skevgp.features import (
     AngleEncoder,
+    Friction,
     InertiaForce,
     InertiaForceGravity,
     LinkGravity,
@@ -62,6 +63,7 @@ def uses(robot):
     terms = ["acceleration", "gravity", "bias", "input"]
     return {
         "AngleEncoder": lambda: mapped(AngleEncoder(model), rows),
+        "Friction": lambda: mapped(Friction(model), rows),
         "InertiaForce": lambda: mapped(InertiaForce(model), rows),
         "InertiaForceGravity": lambda: mapped(InertiaForceGravity(model), rows),
         "LinkGravity": lambda: mapped(LinkGravity(model), rows),

@@ -5,6 +5,7 @@ expression the same function again. A new adapter gets a case in `CASES`; one wi
 import pickle
 from copy import deepcopy
 
+import autograd.numpy as anp
 import casadi as ca
 import numpy as np
 import pytest
@@ -26,14 +27,20 @@ from sklearn.preprocessing import (
 
 from skevgp.features import (
     AngleEncoder,
+    Friction,
     InertiaForce,
     InertiaForceGravity,
     LinkGravity,
+    LogNormal,
     NominalDynamics,
+    Normal,
+    ParametricFeatures,
     RigidBodyRegressor,
+    Uniform,
 )
 from skevgp.features.robot_map import RobotTransformer
 from skevgp.maps import ADAPTERS, NoExpressionError, as_map
+from skevgp.maps.theta import LinearizedFeatures, Theta, theta_jacobian
 
 TERMS = ["acceleration", "gravity", "bias", "input"]
 MASK = np.array([False, True, False, False, True])
@@ -70,6 +77,25 @@ class PerOutput(TransformerMixin, BaseEstimator):
 
     def to_casadi(self, x):
         return [ca.sin(x[:2]), x[1:3] ** 2]
+
+
+class Linearized(LinearizedFeatures):
+    """With a fit, at parameters that are not their medians."""
+
+    def __init__(self, feature_map, columns=None):
+        super().__init__(feature_map, columns)
+
+    def fit(self, X, y=None):
+        feature_map = self.feature_map.fit(X)
+        theta = Theta.of(feature_map)
+        theta.set(np.linspace(0.5, -0.5, len(theta)))
+        jacobian = theta_jacobian(feature_map, X, theta)
+        largest = np.abs(jacobian).reshape(-1, *jacobian.shape[-2:]).max(axis=0)
+        return LinearizedFeatures(feature_map, np.argwhere(largest > 0.0))
+
+
+def wave(X, period, height):
+    return anp.stack([height * anp.sin(X[:, 0] / period), X[:, 1] ** 2 + height], axis=1)
 
 
 def by_columns(*parts, **arguments):
@@ -183,9 +209,35 @@ PHYSICS = {
     "torques, no robot": (RigidBodyRegressor(), 4),
     "torques": (RigidBodyRegressor("acrobot"), 6),
 }
+FACTORS = {f"{kind}(q{i})": LogNormal(1.0, 0.3) for i in (1, 2) for kind in ("mass", "length", "inertia", "damping")}
+NUMBERS = {"stiction_velocity": LogNormal(0.5, 0.5), "sharpness(q2)": Uniform(0.5, 2.5)}
+WITH_PARAMETERS = {
+    "function": (ParametricFeatures(wave, {"period": LogNormal(2.0, 0.5), "height": Normal(1.0, 0.5)}), 4),
+    "sines": (InertiaForceGravity("acrobot", parameters={"offset(q2)": Normal(0.1, 0.1)}), 5),
+    "levers": (InertiaForceGravity("iiwa14", parameters={"offset(q4)": Normal(0.1, 0.1)}), 21),
+    "gravity": (LinkGravity("acrobot", parameters={"offset(q1)": Normal(0.1, 0.1)}), 5),
+    "friction": (Friction("acrobot", stribeck_velocity=2.0, parameters=NUMBERS), 5),
+    "nominal": (NominalDynamics("acrobot", terms=TERMS, parameters=FACTORS), 5),
+    "nominal, ur5": (NominalDynamics("ur5", parameters={"length(elbow_joint)": LogNormal(1.0, 0.2)}), 18),
+    "torques": (RigidBodyRegressor("acrobot", parameters={"stiction_velocity": LogNormal(0.5, 0.5)}), 6),
+    "union": (
+        make_union(
+            InertiaForce("acrobot"),
+            NominalDynamics("acrobot", parameters={"mass(q1)": LogNormal(1.0, 0.3)}),
+            make_pipeline(LinkGravity("acrobot", parameters={"offset(q2)": Normal(0.1, 0.1)}), PolynomialFeatures(2)),
+        ),
+        5,
+    ),
+}
+LINEARIZED = {
+    f"linearized, {name}": (Linearized(feature_map), n_columns)
+    for name, (feature_map, n_columns) in WITH_PARAMETERS.items()
+}
+PHYSICS |= {"friction, no robot": (Friction(), 4), "friction": (Friction("acrobot"), 5), **LINEARIZED}
+PHYSICS["function of parameters"] = WITH_PARAMETERS["function"]
 TIMED = {
     f"{kind.__name__}, {robot}, time step": (kind(robot, dt="column"), n_columns)
-    for kind in (AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics)
+    for kind in (AngleEncoder, Friction, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics)
     for robot, n_columns in (("pendulum", 4), ("acrobot", 6), ("iiwa14", 22))
 }
 CASES = {**{name: (transformer, 5) for name, transformer in SKLEARN.items()}, **PHYSICS, **TIMED}
@@ -204,6 +256,7 @@ BY_DIFFERENCES = {
     "rows",
     "rows, at the end",
     "rows, in the middle",
+    *LINEARIZED,
 }
 WITHOUT_EXPRESSION = {
     "function": "cannot be written in CasADi, as functions of NumPy",
@@ -214,6 +267,7 @@ WITHOUT_EXPRESSION = {
     "rows, in the middle": "comes after a map that returns a row for each output",
     "torques": "RigidBodyRegressor.*StandardScaler.* any transformer with a method to_casadi",
     "torques, no robot": "RigidBodyRegressor",
+    "linearized, torques": r"(?s)The parameters of RigidBodyRegressor.*cannot be written in CasADi",
     **dict.fromkeys([name for name in SKLEARN if name.startswith("spline")], r"SplineTransformer\("),
 }
 
@@ -261,7 +315,8 @@ def test_every_adapter_has_a_case():
             yield from kinds(part)
 
     tried = {kind for transformer, _ in CASES.values() for kind in kinds(transformer)}
-    assert set(ADAPTERS) - tried == {RobotTransformer}  # whose subclasses are there
+    # A subclass of each is there.
+    assert set(ADAPTERS) - tried == {RobotTransformer, LinearizedFeatures}
 
 
 def test_value_is_that_of_transform(name, transformer):
