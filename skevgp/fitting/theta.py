@@ -38,6 +38,8 @@ _LONGEST, _HALVINGS = 1.0, 7
 _NONLINEAR, _FITS = 0.1, 4
 # Number of rows for the starts, of values of θ that are tried per parameter, and of the best of them that are improved.
 _START_ROWS, _TRIED, _IMPROVED = 500, 8, 2
+# Columns of ∂h/∂z that are 0 on so many rows are left out.
+_SEEN_ROWS = 5000
 # Optima of the features alone are different starts if they are so far apart, in prior standard deviations, and if their
 # residuals are not larger than this many times the smallest ones.
 _APART, _AS_GOOD = 0.5, 1.5
@@ -195,9 +197,9 @@ class _Calibrator:
         self.prior = problem.units.prior
         self.p = self.prior.scale.shape[1]
         self.feature_map = data.maps.feature_map
-        self.sample, targets = _sample(data)
+        self.columns = columns_of(self.feature_map, _sample(data, _SEEN_ROWS)[0], theta)
+        self.sample, targets = _sample(data, _START_ROWS)
         self.targets = targets - problem.units.target_mean
-        self.columns = columns_of(self.feature_map, self.sample, theta)
         # z of the last features of the sample.
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -210,9 +212,8 @@ class _Calibrator:
     def features(self, z: np.ndarray) -> np.ndarray:
         """The features of the sample, linearised at z, (k, p + d) or (k, o, p + d). They may be infinite or NaN."""
         if self._last is None or not np.array_equal(self._last[0], z):
-            with np.errstate(all="ignore"):
-                linearized = LinearizedFeatures(map_at(self.feature_map, z), self.columns)
-                self._last = z, linearized.transform(self.sample)
+            linearized = LinearizedFeatures(map_at(self.feature_map, z), self.columns)
+            self._last = z, _values_or_nan(linearized.transform, self.sample)
         return self._last[1]
 
     def alone(self, z: np.ndarray, noise: np.ndarray) -> ThetaStep | None:
@@ -221,8 +222,7 @@ class _Calibrator:
 
     def value_alone(self, z: np.ndarray, noise: np.ndarray) -> float:
         """The log density of the sample and z without a Gaussian process. -inf: the features are not finite."""
-        with np.errstate(all="ignore"):
-            features = np.asarray(transformed(map_at(self.feature_map, z), self.sample), dtype=np.float64)
+        features = _values_or_nan(partial(transformed, map_at(self.feature_map, z)), self.sample)
         step = self._alone(features, z, noise, self.columns[:0])
         return -np.inf if step is None else step.value
 
@@ -353,14 +353,23 @@ def _length(move: np.ndarray, step: ThetaStep) -> float:
     return float(np.max(np.abs(move) / np.sqrt(np.diagonal(np.linalg.inv(step.precision)))))
 
 
-def _sample(data: Dataset) -> tuple[Any, np.ndarray]:
-    """Some rows of X for the feature map, and their targets (k, o)."""
+def _values_or_nan(function: Callable[[Any], Any], rows: Any) -> np.ndarray:
+    """What a map returns, or NaN if it raises a ValueError for numbers that are not finite."""
+    try:
+        with np.errstate(all="ignore"):
+            return np.asarray(function(rows), dtype=np.float64)
+    except ValueError:
+        return np.full((1, 1), np.nan)
+
+
+def _sample(data: Dataset, size: int) -> tuple[Any, np.ndarray]:
+    """Up to ``size`` rows of X for the feature map, and their targets (k, o)."""
     if is_dask(data.X):
-        chosen = evenly_spaced(len(data.X), _START_ROWS)
+        chosen = evenly_spaced(len(data.X), size)
         X, y = data.X[chosen].compute(), data.y[chosen].compute()
     else:
         positions = data.chosen.positions
-        chosen = evenly_spaced(data.chosen.n_rows, _START_ROWS)
+        chosen = evenly_spaced(data.chosen.n_rows, size)
         chosen = chosen if positions is None else positions[chosen]
         X, y = take_rows(data.given, chosen), data.y[chosen]
     return X, np.asarray(y, dtype=np.float64).reshape(len(y), -1)
