@@ -242,8 +242,11 @@ class ExactFit:
     def weight_likelihoods(self, source: Source, prior: CoefficientPrior) -> list[WeightLikelihood]:
         """The likelihood of the weights of each output, for other features, in the user's units."""
         moved = self.moved(source, prior)
-        sparse, values, blocks = moved._sparse_twin()
-        each = sparse.weight_likelihoods(values, sparse.statistics(values, blocks))
+        if self.orthogonal:
+            sparse, values, blocks = moved._sparse_twin()
+            each = sparse.weight_likelihoods(values, sparse.statistics(values, blocks))
+        else:
+            each = moved.model.weight_likelihoods(moved.fit.values)
         return [own.in_units(unit) for own, unit in zip(each, self.units.target_unit, strict=True)]
 
     def _with_prior(self, prior: CoefficientPrior) -> Units:

@@ -23,8 +23,7 @@ from ..data.rows import Source, times_weights
 from ..exceptions import UnidentifiedWarning, warn_user
 from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
 from ..model.predictor import CoefficientPrior
-from ..model.weights import ThetaStep, WeightLikelihood, theta_step
-from ..utils.linalg import jittered_cholesky
+from ..model.weights import ThetaStep, WeightLikelihood, likelihood_of_whitened, theta_step
 from ..utils.monitor import Monitor
 from ..utils.validation import is_dask
 from .problem import Problem
@@ -103,7 +102,7 @@ class ThetaPosterior:
     @classmethod
     def of(cls, theta: Theta, step: ThetaStep) -> ThetaPosterior:
         """The posterior at a value of z, to first order."""
-        return cls(theta, step.z + step.newton(), np.linalg.inv(step.precision))
+        return cls(theta, step.z + step.newton(), step.deviation().covariance)
 
     def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
         """Posterior medians and standard deviations by name, and the covariance (q, q) of the parameters."""
@@ -156,12 +155,12 @@ def extended(prior: CoefficientPrior, step: ThetaStep) -> CoefficientPrior:
     root[:, :p, :p] = prior.roots()
     for output in range(o):
         # Shared weights have one posterior, and all of the information is in the first output.
-        from_others, precision = step.cavity(0 if prior.shared else output)
-        covariance = np.linalg.inv(precision)[np.ix_(active, active)]
-        L, K = jittered_cholesky(covariance), step.K[output][:, active]
+        from_others, deviation = step.cavity(0 if prior.shared else output)
+        own = slice(p, p + len(active))
+        W, widths, K = deviation.W[np.ix_(active, active)], deviation.widths[active], step.K[output][:, active]
         mean[output, p:] = K @ from_others[active]
-        root[output, p:, p : p + len(active)] = K @ L
-        reference[output, p : p + len(active)] = -np.linalg.solve(L, from_others[active])
+        root[output, p:, own] = K @ (W * widths)
+        reference[output, own] = -(W.T @ from_others[active]) / widths
     scale[...] = np.sqrt(np.square(root).sum(axis=2))
     groups = None if prior.groups is None else np.hstack([prior.groups, np.full((o, d), -1)])
     return CoefficientPrior(mean, scale, reference, root, prior.shared, prior.labels, groups)
@@ -213,7 +212,7 @@ class _Calibrator:
         for o, variance in enumerate(noise):
             H = features if features.ndim == 2 else features[:, o]
             r = self.targets[:, o] - H[:, : self.p] @ prior.mean[o]
-            likelihoods.append(WeightLikelihood(H.T @ H / variance, H.T @ r / variance, float(r @ r / variance)))
+            likelihoods.append(likelihood_of_whitened(H / np.sqrt(variance), r / np.sqrt(variance)))
         return theta_step(likelihoods, prior, self.columns, z)
 
     def residual_variance(self, step: ThetaStep) -> np.ndarray:
@@ -306,7 +305,7 @@ def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
 
 def _length(move: np.ndarray, step: ThetaStep) -> float:
     """The largest component of a step, in posterior standard deviations."""
-    return float(np.max(np.abs(move) / np.sqrt(np.diagonal(np.linalg.inv(step.precision)))))
+    return float(np.max(np.abs(move) / step.deviation().std))
 
 
 def _sample(data: Dataset) -> tuple[Any, np.ndarray]:
