@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
+import autograd.numpy as anp
 import numpy as np
 from autograd import make_jvp
 from numpy.typing import ArrayLike
@@ -56,7 +57,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
     ------
     ValueError, TypeError
         By `fit`: if a parameter has no prior or is unknown to ``function``, or if ``function`` returns another shape or
-        numbers that are not finite for another θ, up to three prior standard deviations.
+        numbers that are not finite for another θ, up to three prior standard deviations, or if its derivatives are not
+        finite at the prior medians.
 
     See Also
     --------
@@ -188,7 +190,11 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         jacobian : ndarray of shape (n_samples, n_h, n_theta) or (n_samples, n_outputs, n_h, n_theta)
             ∂h/∂θ, in the order of ``parameters``.
         """
-        X, names = np.asarray(X, dtype=np.float64), list(self.parameters)
+        # Values of the parameters at which it is not finite are no optimum.
+        with np.errstate(all="ignore"):
+            return self._theta_jacobian(np.asarray(X, dtype=np.float64), list(self.parameters))
+
+    def _theta_jacobian(self, X: np.ndarray, names: list[str]) -> np.ndarray:
         if self.derivatives == "differences":
             return np.stack([self._difference(X, name) for name in names], axis=-1)
         theta = np.array([self.theta_[name] for name in names])
@@ -242,6 +248,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
 
     def _at(self, X: Any, theta: Mapping[str, Any]) -> Any:
         values = self.function(X, **theta)
+        if not hasattr(values, "ndim"):
+            values = anp.array(values)
         return values.reshape(-1, 1) if values.ndim == 1 else values
 
     def _tangent(self, function: Callable[[Any], Any], at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -313,3 +321,11 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
             shape = found.shape
         assert shape is not None
         self._width, self._ndim = (1, 2) if len(shape) == 1 else (shape[-1], len(shape))
+        slopes = self.theta_jacobian(X)
+        for index, name in enumerate(self.parameters):
+            if not np.isfinite(slopes[..., index]).all():
+                raise ValueError(
+                    f"The derivative of the function {self.function!r} of ParametricFeatures in {name} is NaN or "
+                    f"infinite at its prior median, {name}={medians[name]:.6g}. Change the function there, or "
+                    'use derivatives="differences".'
+                )

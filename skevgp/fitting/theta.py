@@ -36,6 +36,8 @@ _LONGEST, _HALVINGS = 1.0, 7
 _MOVED, _FITS = 0.5, 4
 # Number of rows for the starts, of values of θ that are tried per parameter, and of those that are improved.
 _START_ROWS, _TRIED, _IMPROVED = 300, 8, 4
+# Values of all z at which columns of ∂h/∂z are found.
+_TRIED_SLOPES = (0.0, 0.37, -0.61)
 # Optima of the features alone are different starts if they are so far apart, in prior standard deviations, and if their
 # residuals are not larger than this many times the smallest ones.
 _APART, _AS_GOOD = 0.5, 1.5
@@ -101,7 +103,7 @@ class ThetaPosterior:
 
     @classmethod
     def of(cls, theta: Theta, step: ThetaStep) -> ThetaPosterior:
-        """The posterior at a value of z, to first order."""
+        """The posterior for features that are linear in z, as they are at a step."""
         return cls(theta, step.z + step.newton(), step.deviation().covariance)
 
     def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
@@ -138,10 +140,17 @@ def map_at(feature_map: Any, z: np.ndarray) -> Any:
     return copied
 
 
-def columns_of(feature_map: Any, rows: Any, theta: Theta) -> np.ndarray:
-    """The feature and the parameter (d, 2) of each column of ∂h/∂z that is not 0 on some rows."""
-    jacobian = theta_jacobian(feature_map, rows, theta)
-    return np.argwhere(np.abs(jacobian).reshape(-1, *jacobian.shape[-2:]).max(axis=0) > 0.0)
+def columns_of(feature_map: Any, rows: Any, q: int) -> np.ndarray:
+    """The feature and the parameter (d, 2) of each column of ∂h/∂z (q,) that is not 0 on some rows."""
+    used: Any = False
+    # At one value alone, a column may be 0 by chance, such as that of cos(θ x) at θ = 0.
+    for at in _TRIED_SLOPES:
+        moved = map_at(feature_map, np.full(q, at))
+        theta = Theta.of(moved)
+        assert theta is not None
+        jacobian = np.abs(theta_jacobian(moved, rows, theta))
+        used = used | (jacobian.reshape(-1, *jacobian.shape[-2:]) > 0.0).any(axis=0)
+    return np.argwhere(used)
 
 
 def extended(prior: CoefficientPrior, step: ThetaStep) -> CoefficientPrior:
@@ -190,7 +199,7 @@ class _Calibrator:
         self.feature_map = data.maps.feature_map
         self.sample, targets = _sample(data)
         self.targets = targets - problem.units.target_mean
-        self.columns = columns_of(self.feature_map, self.sample, theta)
+        self.columns = columns_of(self.feature_map, self.sample, len(theta))
 
     def data_at(self, z: np.ndarray) -> Dataset:
         """The data with the features linearised at z."""
@@ -228,7 +237,11 @@ class _Calibrator:
         tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(int(np.ceil(np.log2(_TRIED * q)))))
         squares = np.mean(self.targets**2, axis=0)
         first = self.alone(np.zeros(q), np.where(squares > 0.0, squares, 1.0))
-        assert first is not None
+        if first is None:
+            raise ValueError(
+                f"The features or their derivatives in the parameters {list(self.theta.names)} are NaN or infinite at "
+                "the prior medians."
+            )
         noise = self.residual_variance(first)
         values = [-np.inf if (step := self.alone(z, noise)) is None else step.value for z in tried]
         best = [tried[i] for i in np.argsort(values)[::-1][: _IMPROVED - 1] if np.isfinite(values[i])]
@@ -343,9 +356,11 @@ def calibrate(
     for step in starts:
         fitted = fit(own.problem_at(step, own.data_at(step.z)), None, True)
         step = own.settled(step, fitted)
-        bound = -0.5 * float(step.z @ step.z)
+        bound = 0.0
         if len(starts) > 1:
-            bound += own.finished(step, own.data_at(step.z), fitted).lower_bound
+            bound = own.finished(step, own.data_at(step.z), fitted).lower_bound
+            if not own.prior.shared:
+                bound -= step.counted_twice()
         if best is None or bound > best[0]:
             best = bound, step, fitted
     assert best is not None
@@ -360,6 +375,9 @@ def calibrate(
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
     posterior = ThetaPosterior.of(found, step)
+    if _length(step.newton(), step) > _MOVED:
+        # A Newton step that raises log p(y, z) at no length is one of rounding errors, or of a kink.
+        posterior = replace(posterior, mean=step.z)
     return Calibration(at_mode, own.problem_at(step, at_mode), own.finished(step, at_mode, fitted), posterior)
 
 

@@ -108,6 +108,20 @@ class ThetaStep:
         gradient = np.delete(self.gradient, output, axis=0).sum(axis=0)
         return deviation.covariance_times(gradient - self.z), deviation
 
+    def counted_twice(self) -> float:
+        """Σ_o log p(y_o | other outputs) - log p(y), to first order, for outputs that do not share their weights."""
+        # With log p(y_o | z) = c_o + g_oᵀ(z - ẑ) - ½ (z - ẑ)ᵀ P_o (z - ẑ), the integrals over z with the priors N(0, I)
+        # and N(ẑ + m_o, (I + Σ_other P)⁻¹) have Σ g_o - ẑ and I + Σ P_o in common.
+        deviation = self.deviation()
+        total = self.gradient.sum(axis=0) - self.z
+        common = float(np.log(deviation.widths).sum()) + 0.5 * float(total @ deviation.covariance_times(total))
+        found = 0.5 * float(self.z @ self.z) - common
+        for output in range(len(self.gradient)):
+            mean, others = self.cavity(output)
+            found += common - float(np.log(others.widths).sum())
+            found -= 0.5 * float(np.square(others.W.T @ mean / others.widths).sum())
+        return found
+
 
 @dataclass(frozen=True)
 class Deviation:
