@@ -100,11 +100,17 @@ class ThetaPosterior:
     # (q,) and (q, q): mean and covariance of z.
     mean: np.ndarray
     covariance: np.ndarray
+    # Nats by which the models' log likelihoods, each given the other outputs, are above that of all outputs together.
+    counted_twice: float = 0.0
 
     @classmethod
-    def of(cls, theta: Theta, step: ThetaStep) -> ThetaPosterior:
-        """The posterior for features that are linear in z, as they are at a step."""
-        return cls(theta, step.z + step.newton(), step.deviation().covariance)
+    def of(cls, theta: Theta, step: ThetaStep, together: bool) -> ThetaPosterior:
+        """The posterior for features that are linear in z, as they are at a step.
+
+        ``together``: no nats are counted twice.
+        """
+        twice = 0.0 if together else step.counted_twice()
+        return cls(theta, step.z + step.newton(), step.deviation().covariance, twice)
 
     def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
         """Posterior medians and standard deviations by name, and the covariance (q, q) of the parameters."""
@@ -196,6 +202,8 @@ class _Calibrator:
         self.data, self.problem, self.theta = data, problem, theta
         self.prior = problem.units.prior
         self.p = self.prior.scale.shape[1]
+        # Whether one model has all outputs. (If f is orthogonal, bounds are those of a free f, but steps are not.)
+        self.together = self.prior.shared or problem.orthogonal
         self.feature_map = data.maps.feature_map
         self.sample, targets = _sample(data)
         self.targets = targets - problem.units.target_mean
@@ -359,8 +367,7 @@ def calibrate(
         bound = 0.0
         if len(starts) > 1:
             bound = own.finished(step, own.data_at(step.z), fitted).lower_bound
-            if not own.prior.shared:
-                bound -= step.counted_twice()
+            bound -= 0.0 if own.together else step.counted_twice()
         if best is None or bound > best[0]:
             best = bound, step, fitted
     assert best is not None
@@ -374,7 +381,7 @@ def calibrate(
     at_mode = own.data_at(step.z)
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
-    posterior = ThetaPosterior.of(found, step)
+    posterior = ThetaPosterior.of(found, step, own.together)
     if _length(step.newton(), step) > _MOVED:
         # A Newton step that raises log p(y, z) at no length is one of rounding errors, or of a kink.
         posterior = replace(posterior, mean=step.z)
@@ -389,4 +396,5 @@ def after_more_rows(
     prior = restricted(fitted.prior, p)
     z = posterior.theta.coordinates()
     step = theta_step(fitted.weight_likelihoods(), prior, linearized.columns, z)
-    return ThetaPosterior.of(posterior.theta, step), fitted.reweighted(extended(prior, step))
+    together = prior.shared or fitted.models[0].sparse.orthogonal
+    return ThetaPosterior.of(posterior.theta, step, together), fitted.reweighted(extended(prior, step))

@@ -59,11 +59,12 @@ def weight_likelihoods(group: Group) -> list[WeightLikelihood]:
         linear = np.block([[statistics.HH, HR], [HR.T, statistics.RR[[o]][:, np.newaxis]]])
         crossed = np.hstack([statistics.VH, statistics.VR[:, [o]]])
         VV = statistics.VV
+        of_V = 1.0 + signal / noise * diagonal_of(VV)
         if group.orthogonal:
             VV, crossed = group.orthogonalised(o, crossed, linear[:-1])
         D = VV * (signal / noise)
         diagonal_of(D)[...] += 1.0
-        A = triangular_inverse(jittered_cholesky(D)) @ crossed if m else crossed
+        A = triangular_inverse(jittered_cholesky(D, sizes=of_V)) @ crossed if m else crossed
         total, sizes = (linear - signal / noise * (A.T @ A)) / noise, diagonal_of(statistics.HH) / noise
         found.append(WeightLikelihood(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), sizes))
     return found
