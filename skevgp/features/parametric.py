@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ..utils.sklearn import StrOptions, fit_context
+from ..utils.sklearn import StrOptions, check_feature_names_in, fit_context
 from ..utils.state import StatefulEstimator
 from .theta import Prior, check_prior
 
@@ -21,6 +21,21 @@ from .theta import Prior, check_prior
 _EDGE, _TRIED_ROWS = 3.0, 64
 # Step of central differences of fourth order, in prior standard deviations: errors are about 1e-11 of the values.
 _STEP = 1e-3
+
+
+class _Symbol(np.ndarray):
+    """A symbol as an array without axes. Functions of it are such arrays too, and not symbols as NumPy has them."""
+
+    @classmethod
+    def of(cls, symbol: Any) -> _Symbol:
+        found = np.empty((), dtype=object)
+        found[()] = symbol
+        return found.view(cls)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        plain = (own.view(np.ndarray) if isinstance(own, _Symbol) else own for own in inputs)
+        found = getattr(ufunc, method)(*plain, **kwargs)
+        return found if isinstance(found, np.ndarray) else _Symbol.of(found)
 
 
 class ParametricFeatures(TransformerMixin, StatefulEstimator):
@@ -143,8 +158,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
 
         Parameters
         ----------
-        input_features : Ignored
-            Not used.
+        input_features : array-like of str or None, default=None
+            Names of the columns of X. They are only compared with those that `fit` has seen.
 
         Returns
         -------
@@ -152,6 +167,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
             Name of the function, with a number if there are several features.
         """
         check_is_fitted(self)
+        check_feature_names_in(self, input_features)
         name = getattr(self.function, "__name__", "h").strip("<>")
         return np.array([name] if self._width == 1 else [f"{name}{i}" for i in range(self._width)], dtype=object)
 
@@ -238,8 +254,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         row, numbers = np.empty((1, len(x)), dtype=object), {}
         row[0] = x
         for name, symbol in theta.items():
-            numbers[name] = np.empty((), dtype=object)
-            numbers[name][()] = symbol
+            numbers[name] = _Symbol.of(symbol)
         found = np.asarray(self._at(row, numbers), dtype=object)[0]
         return found.tolist() if self._ndim == 3 else [found.tolist()]
 

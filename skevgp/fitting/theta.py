@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
+from sklearn.exceptions import ConvergenceWarning
 
 from ..data.dataset import Dataset
 from ..data.maps import evenly_spaced, take_rows
@@ -47,6 +48,8 @@ _TURNS, _LEAST_RESIDUAL = 3, 1e-14
 _STARTS = 3
 # The data do not identify a parameter if its posterior standard deviation is above this share of the prior's.
 _UNIDENTIFIED = 0.95
+# They ask for a value outside of its prior if it is also further than so many standard deviations from the median.
+_EDGE = 2.0
 
 
 class FitOfTheta(Protocol):
@@ -83,7 +86,13 @@ class Calibration:
     posterior: ThetaPosterior
 
     def warn(self) -> None:
-        """Warn if the data do not identify a parameter."""
+        """Warn if the data do not identify a parameter, or ask for values outside of its prior."""
+        if names := self.posterior.at_edges():
+            warn_user(
+                f"The parameters {names} ended at the edges of their priors, where their standard deviations are not "
+                "valid. Give them wider priors if the data may be right.",
+                ConvergenceWarning,
+            )
         if names := self.posterior.unidentified():
             warn_user(
                 f"The data do not identify the parameters {names}: their posterior is as wide as their prior. Fix "
@@ -122,8 +131,18 @@ class ThetaPosterior:
 
     def unidentified(self) -> list[str]:
         """Names of the parameters of which the data say nothing."""
-        wide = np.sqrt(np.diagonal(self.covariance)) > _UNIDENTIFIED
-        return [name for name, own in zip(self.theta.names, wide, strict=True) if own]
+        return self._named(self._wide & (np.abs(self.mean) <= _EDGE))
+
+    def at_edges(self) -> list[str]:
+        """Names of the parameters at a bound of their prior: there, a value hardly depends on its coordinate."""
+        return self._named(self._wide & (np.abs(self.mean) > _EDGE))
+
+    @property
+    def _wide(self) -> np.ndarray:
+        return np.sqrt(np.diagonal(self.covariance)) > _UNIDENTIFIED
+
+    def _named(self, chosen: np.ndarray) -> list[str]:
+        return [name for name, own in zip(self.theta.names, chosen, strict=True) if own]
 
     def intervals(self, probability: float = 0.95) -> dict[str, tuple[float, float]]:
         """A credible interval of each parameter. It stays within the bounds of the prior."""

@@ -24,7 +24,6 @@ from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse
 from .bounds import Group
 from .predictor import CoefficientPrior
 
-
 # Information that is less than this share of that without f and the weights is a rounding error.
 _ROUNDING = 1e-14
 
