@@ -494,7 +494,8 @@ NASTY_MAPS = {
 }
 
 
-# As many as hypothesis tries elsewhere (tests/properties/conftest.py), and those that failed.
+# Some of the cases, and those that failed once.
+@pytest.mark.long
 @settings(max_examples=25, derandomize=True, database=None, deadline=None)
 @given(
     st.sampled_from(sorted(NASTY_MAPS)),
