@@ -10,10 +10,14 @@ from skevgp.features import (
     InertiaForce,
     InertiaForceGravity,
     LinkGravity,
+    LogNormal,
     NominalDynamics,
+    ParametricFeatures,
     RigidBodyRegressor,
 )
 from skevgp.solvers import LBFGS
+
+from .theta import decay
 
 pytestmark = pytest.mark.long
 MAPS = [
@@ -25,6 +29,7 @@ MAPS = [
     LinkGravity(),
     NominalDynamics(),
     RigidBodyRegressor(),
+    ParametricFeatures(decay, {"rate": LogNormal(0.1, 0.3)}),
 ]
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.

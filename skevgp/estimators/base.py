@@ -257,6 +257,11 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             raise AttributeError(f"{kind} has {name} only after fit.")
         raise AttributeError(f"{kind!r} object has no attribute {name!r}")
 
+    @property
+    def _counted_twice(self) -> float:
+        # Models of outputs whose features share parameters are each given the other outputs.
+        return 0.0 if self._theta is None else self._theta.counted_twice
+
     # --- validation before, and attributes after a fit ----------------------------------------------------------------
 
     def _before_fit(self, X: Any) -> Self:

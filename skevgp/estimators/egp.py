@@ -292,7 +292,7 @@ class EGPRegressor(GaussianProcess):
             if vague.any():
                 self.coef_prior_scale_[vague[0] if self.coef_prior_scale_.ndim == 1 else vague] = np.inf
             self._spec = problem.spec
-            self.log_marginal_likelihood_value_ = fitted.log_marginal_likelihood
+            self.log_marginal_likelihood_value_ = fitted.log_marginal_likelihood - self._counted_twice
             self.loss_curve_ = fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
         self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)

@@ -454,13 +454,13 @@ class EVGPRegressor(GaussianProcess):
         """Lower bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
         # After partial_fit it is computed when it is read.
         with single_threaded_libraries():
-            return float(self._fitted.lower_bound)
+            return float(self._fitted.lower_bound) - self._counted_twice
 
     @property
     def upper_bound_(self) -> float:
         """Upper bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
         with single_threaded_libraries():
-            return float(self._fitted.upper_bound)
+            return float(self._fitted.upper_bound) - self._counted_twice
 
     # Columns of X that were subtracted from y, so that their noise is in y too. `ResidualRegressor` sets them.
     _columns_changed: np.ndarray | None = None

@@ -6,13 +6,14 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
+import autograd.numpy as anp
 import numpy as np
 from autograd import make_jvp
 from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ..utils.sklearn import StrOptions, fit_context
+from ..utils.sklearn import StrOptions, check_feature_names_in, fit_context
 from ..utils.state import StatefulEstimator
 from .theta import Prior, check_prior
 
@@ -20,6 +21,21 @@ from .theta import Prior, check_prior
 _EDGE, _TRIED_ROWS = 3.0, 64
 # Step of central differences of fourth order, in prior standard deviations: errors are about 1e-11 of the values.
 _STEP = 1e-3
+
+
+class _Symbol(np.ndarray):
+    """A symbol as an array without axes. Functions of it are such arrays too, and not symbols as NumPy has them."""
+
+    @classmethod
+    def of(cls, symbol: Any) -> _Symbol:
+        found = np.empty((), dtype=object)
+        found[()] = symbol
+        return found.view(cls)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        plain = (own.view(np.ndarray) if isinstance(own, _Symbol) else own for own in inputs)
+        found = getattr(ufunc, method)(*plain, **kwargs)
+        return found if isinstance(found, np.ndarray) else _Symbol.of(found)
 
 
 class ParametricFeatures(TransformerMixin, StatefulEstimator):
@@ -56,7 +72,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
     ------
     ValueError, TypeError
         By `fit`: if a parameter has no prior or is unknown to ``function``, or if ``function`` returns another shape or
-        numbers that are not finite for another θ, up to three prior standard deviations.
+        numbers that are not finite for another θ, up to three prior standard deviations, or if its derivatives are not
+        finite at the prior medians.
 
     See Also
     --------
@@ -141,8 +158,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
 
         Parameters
         ----------
-        input_features : Ignored
-            Not used.
+        input_features : array-like of str or None, default=None
+            Names of the columns of X. They are only compared with those that `fit` has seen.
 
         Returns
         -------
@@ -150,6 +167,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
             Name of the function, with a number if there are several features.
         """
         check_is_fitted(self)
+        check_feature_names_in(self, input_features)
         name = getattr(self.function, "__name__", "h").strip("<>")
         return np.array([name] if self._width == 1 else [f"{name}{i}" for i in range(self._width)], dtype=object)
 
@@ -188,7 +206,11 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         jacobian : ndarray of shape (n_samples, n_h, n_theta) or (n_samples, n_outputs, n_h, n_theta)
             ∂h/∂θ, in the order of ``parameters``.
         """
-        X, names = np.asarray(X, dtype=np.float64), list(self.parameters)
+        # Values of the parameters at which it is not finite are no optimum.
+        with np.errstate(all="ignore"):
+            return self._theta_jacobian(np.asarray(X, dtype=np.float64), list(self.parameters))
+
+    def _theta_jacobian(self, X: np.ndarray, names: list[str]) -> np.ndarray:
         if self.derivatives == "differences":
             return np.stack([self._difference(X, name) for name in names], axis=-1)
         theta = np.array([self.theta_[name] for name in names])
@@ -232,8 +254,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         row, numbers = np.empty((1, len(x)), dtype=object), {}
         row[0] = x
         for name, symbol in theta.items():
-            numbers[name] = np.empty((), dtype=object)
-            numbers[name][()] = symbol
+            numbers[name] = _Symbol.of(symbol)
         found = np.asarray(self._at(row, numbers), dtype=object)[0]
         return found.tolist() if self._ndim == 3 else [found.tolist()]
 
@@ -242,6 +263,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
 
     def _at(self, X: Any, theta: Mapping[str, Any]) -> Any:
         values = self.function(X, **theta)
+        if not hasattr(values, "ndim"):
+            values = anp.array(values)
         return values.reshape(-1, 1) if values.ndim == 1 else values
 
     def _tangent(self, function: Callable[[Any], Any], at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -311,3 +334,11 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
             shape = found.shape
         assert shape is not None
         self._width, self._ndim = (1, 2) if len(shape) == 1 else (shape[-1], len(shape))
+        slopes = self.theta_jacobian(X)
+        for index, name in enumerate(self.parameters):
+            if not np.isfinite(slopes[..., index]).all():
+                raise ValueError(
+                    f"The derivative of the function {self.function!r} of ParametricFeatures in {name} is NaN or "
+                    f"infinite at its prior median, {name}={medians[name]:.6g}. Change the function there, or "
+                    'use derivatives="differences".'
+                )

@@ -242,8 +242,11 @@ class ExactFit:
     def weight_likelihoods(self, source: Source, prior: CoefficientPrior) -> list[WeightLikelihood]:
         """The likelihood of the weights of each output, for other features, in the user's units."""
         moved = self.moved(source, prior)
-        sparse, values, blocks = moved._sparse_twin()
-        each = sparse.weight_likelihoods(values, sparse.statistics(values, blocks))
+        if self.orthogonal:
+            sparse, values, blocks = moved._sparse_twin()
+            each = sparse.weight_likelihoods(values, sparse.statistics(values, blocks))
+        else:
+            each = moved.model.weight_likelihoods(moved.fit.values)
         return [own.in_units(unit) for own, unit in zip(each, self.units.target_unit, strict=True)]
 
     def _with_prior(self, prior: CoefficientPrior) -> Units:
@@ -253,9 +256,13 @@ class ExactFit:
     def _sparse_twin(self) -> tuple[SparseModel, Values, Blocks]:
         """The sparse model whose inducing points are the rows, its values, and its rows."""
         model, o = self.model, len(self.units.target_unit)
-        groups = tuple(slice(i, i + 1) for i in range(o)) if model.kernels is not None else (slice(0, o),)
+        groups: tuple[slice, ...] = (slice(0, o),)
+        kernels = model.kernels
+        if kernels is not None or model.rows.features.ndim == 3:
+            # Outputs with rows of their own have a set of points each.
+            groups, kernels = tuple(slice(i, i + 1) for i in range(o)), kernels or (model.kernel,) * o
         sparse = SparseModel(
-            model.kernel, model.prior, "full", groups, complete=True, kernels=model.kernels, orthogonal=self.orthogonal
+            model.kernel, model.prior, "full", groups, complete=True, kernels=kernels, orthogonal=self.orthogonal
         )
         points = np.array([model.rows.of(group).inputs for group in groups])
         rows = Rows(LocalSource.holding(model.rows), _as_it_is)

@@ -231,6 +231,16 @@ class FittedModel:
             known_upper_bound=upper,
         )
 
+    def weight_likelihoods(self, prior: CoefficientPrior, rows: Rows | None) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output for a prior and, if ``rows`` are given, for their features."""
+        sparse, statistics = replace(self.sparse, prior=prior), self.statistics
+        if rows is not None:
+            if self.is_exact:
+                return exact_twin(sparse, self.table, rows).weight_likelihoods(self.values)
+            blocks = sparse.blocks(rows, self.values["inducing_points"].shape[1])
+            statistics = sparse.statistics(self.values, blocks)
+        return sparse.weight_likelihoods(self.values, statistics)
+
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
         """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.
 
@@ -321,11 +331,7 @@ class Fitted:
         rows, internal = None if source is None else units.rows(source), units.internal_prior()
         found: dict[int, WeightLikelihood] = {}
         for own, one in zip(self.outputs, self.models, strict=True):
-            sparse, statistics = replace(one.sparse, prior=internal.outputs(own)), one.statistics
-            if rows is not None:
-                blocks = sparse.blocks(rows.outputs(own), one.values["inducing_points"].shape[1])
-                statistics = sparse.statistics(one.values, blocks)
-            each = sparse.weight_likelihoods(one.values, statistics)
+            each = one.weight_likelihoods(internal.outputs(own), None if rows is None else rows.outputs(own))
             found |= {o: each[i].in_units(units.target_unit[o]) for i, o in enumerate(own)}
         return [found[o] for o in sorted(found)]
 

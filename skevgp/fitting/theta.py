@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
+from sklearn.exceptions import ConvergenceWarning
 
 from ..data.dataset import Dataset
 from ..data.maps import evenly_spaced, take_rows, transformed
@@ -23,8 +24,7 @@ from ..data.rows import Source, times_weights
 from ..exceptions import UnidentifiedWarning, warn_user
 from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
 from ..model.predictor import CoefficientPrior, Predictor
-from ..model.weights import ThetaStep, WeightLikelihood, theta_step
-from ..utils.linalg import jittered_cholesky
+from ..model.weights import ThetaStep, WeightLikelihood, likelihood_of_whitened, theta_step
 from ..utils.monitor import Monitor
 from ..utils.validation import is_dask
 from .problem import Problem
@@ -36,10 +36,16 @@ _LONGEST, _HALVINGS = 1.0, 7
 # Another fit follows, up to so many in all, if the features of the last one were not linear in θ on the way to its
 # mode: if their errors have an rms of more than this many standard deviations of the noise.
 _NONLINEAR, _FITS = 0.1, 4
-# Number of rows for the starts, of values of θ that are tried per parameter, and of the best of them that are improved.
-_START_ROWS, _TRIED, _IMPROVED = 500, 8, 2
+# Number of rows for the starts, of values of θ that are tried per parameter with a narrow or a broad prior, and of the
+# best of them that are improved.
+_START_ROWS, _TRIED_NARROW, _TRIED_BROAD, _IMPROVED = 500, 4, 64, 2
 # Columns of ∂h/∂z that are 0 on so many rows are left out.
 _SEEN_ROWS = 5000
+# Values of all z at which columns of ∂h/∂z are found.
+_TRIED_SLOPES = (0.0, 0.37, -0.61)
+# A Newton step that is longer than so many posterior standard deviations, but does not raise log p(y, z) at any length,
+# is one of rounding errors, or of a kink.
+_MOVED = 0.5
 # Optima of the features alone are different starts if they are so far apart, in prior standard deviations, and if their
 # residuals are not larger than this many times the smallest ones.
 _APART, _AS_GOOD = 0.5, 1.5
@@ -47,10 +53,13 @@ _APART, _AS_GOOD = 0.5, 1.5
 _TURNS, _LEAST_RESIDUAL = 3, 1e-14
 # Number of starts with a Gaussian process.
 _STARTS = 3
-# Step of differences, in posterior standard deviations.
-_DIFFERENCE = 0.1
+# Step of differences, in posterior standard deviations. A second derivative that is below this share of Gauss and
+# Newton's is one of rounding errors, or of a kink.
+_DIFFERENCE, _FLAT = 0.1, 0.1
 # The data do not identify a parameter if its posterior standard deviation is above this share of the prior's.
 _UNIDENTIFIED = 0.95
+# They ask for a value outside of its prior if it is also further than so many standard deviations from the median.
+_EDGE = 2.0
 
 
 class FitOfTheta(Protocol):
@@ -90,7 +99,13 @@ class Calibration:
     posterior: ThetaPosterior
 
     def warn(self) -> None:
-        """Warn if the data do not identify a parameter."""
+        """Warn if the data do not identify a parameter, or ask for values outside of its prior."""
+        if names := self.posterior.at_edges():
+            warn_user(
+                f"The parameters {names} ended at the edges of their priors, where their standard deviations are not "
+                "valid. Give them wider priors if the data may be right.",
+                ConvergenceWarning,
+            )
         if names := self.posterior.unidentified():
             warn_user(
                 f"The data do not identify the parameters {names}: their posterior is as wide as their prior. Fix "
@@ -107,11 +122,17 @@ class ThetaPosterior:
     # (q,) and (q, q): mean and covariance of z.
     mean: np.ndarray
     covariance: np.ndarray
+    # Nats by which the models' log likelihoods, each given the other outputs, are above that of all outputs together.
+    counted_twice: float = 0.0
 
     @classmethod
-    def of(cls, theta: Theta, step: ThetaStep) -> ThetaPosterior:
-        """The posterior at a value of z, to first order."""
-        return cls(theta, step.z + step.newton(), np.linalg.inv(step.precision))
+    def of(cls, theta: Theta, step: ThetaStep, together: bool) -> ThetaPosterior:
+        """The posterior for features that are linear in z, as they are at a step.
+
+        ``together``: no nats are counted twice.
+        """
+        twice = 0.0 if together else step.counted_twice()
+        return cls(theta, step.z + step.newton(), step.deviation().covariance, twice)
 
     def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
         """Posterior medians and standard deviations by name, and the covariance (q, q) of the parameters."""
@@ -123,8 +144,18 @@ class ThetaPosterior:
 
     def unidentified(self) -> list[str]:
         """Names of the parameters of which the data say nothing."""
-        wide = np.sqrt(np.diagonal(self.covariance)) > _UNIDENTIFIED
-        return [name for name, own in zip(self.theta.names, wide, strict=True) if own]
+        return self._named(self._wide & (np.abs(self.mean) <= _EDGE))
+
+    def at_edges(self) -> list[str]:
+        """Names of the parameters at a bound of their prior: there, a value hardly depends on its coordinate."""
+        return self._named(self._wide & (np.abs(self.mean) > _EDGE))
+
+    @property
+    def _wide(self) -> np.ndarray:
+        return np.sqrt(np.diagonal(self.covariance)) > _UNIDENTIFIED
+
+    def _named(self, chosen: np.ndarray) -> list[str]:
+        return [name for name, own in zip(self.theta.names, chosen, strict=True) if own]
 
     def intervals(self, probability: float = 0.95) -> dict[str, tuple[float, float]]:
         """A credible interval of each parameter. It stays within the bounds of the prior."""
@@ -147,10 +178,17 @@ def map_at(feature_map: Any, z: np.ndarray) -> Any:
     return copied
 
 
-def columns_of(feature_map: Any, rows: Any, theta: Theta) -> np.ndarray:
-    """The feature and the parameter (d, 2) of each column of ∂h/∂z that is not 0 on some rows."""
-    jacobian = theta_jacobian(feature_map, rows, theta)
-    return np.argwhere(np.abs(jacobian).reshape(-1, *jacobian.shape[-2:]).max(axis=0) > 0.0)
+def columns_of(feature_map: Any, rows: Any, q: int) -> np.ndarray:
+    """The feature and the parameter (d, 2) of each column of ∂h/∂z (q,) that is not 0 on some rows."""
+    used: Any = False
+    # At one value alone, a column may be 0 by chance, such as that of cos(θ x) at θ = 0.
+    for at in _TRIED_SLOPES:
+        moved = map_at(feature_map, np.full(q, at))
+        theta = Theta.of(moved)
+        assert theta is not None
+        jacobian = np.abs(theta_jacobian(moved, rows, theta))
+        used = used | (jacobian.reshape(-1, *jacobian.shape[-2:]) > 0.0).any(axis=0)
+    return np.argwhere(used)
 
 
 def extended(prior: CoefficientPrior, step: ThetaStep) -> CoefficientPrior:
@@ -164,12 +202,12 @@ def extended(prior: CoefficientPrior, step: ThetaStep) -> CoefficientPrior:
     root[:, :p, :p] = prior.roots()
     for output in range(o):
         # Shared weights have one posterior, and all of the information is in the first output.
-        from_others, precision = step.cavity(0 if prior.shared else output)
-        covariance = np.linalg.inv(precision)[np.ix_(active, active)]
-        L, K = jittered_cholesky(covariance), step.K[output][:, active]
+        from_others, deviation = step.cavity(0 if prior.shared else output)
+        own = slice(p, p + len(active))
+        W, widths, K = deviation.W[np.ix_(active, active)], deviation.widths[active], step.K[output][:, active]
         mean[output, p:] = K @ from_others[active]
-        root[output, p:, p : p + len(active)] = K @ L
-        reference[output, p : p + len(active)] = -np.linalg.solve(L, from_others[active])
+        root[output, p:, own] = K @ (W * widths)
+        reference[output, own] = -(W.T @ from_others[active]) / widths
     scale[...] = np.sqrt(np.square(root).sum(axis=2))
     groups = None if prior.groups is None else np.hstack([prior.groups, np.full((o, d), -1)])
     return CoefficientPrior(mean, scale, reference, root, prior.shared, prior.labels, groups)
@@ -196,8 +234,10 @@ class _Calibrator:
         self.data, self.problem, self.theta = data, problem, theta
         self.prior = problem.units.prior
         self.p = self.prior.scale.shape[1]
+        # Whether one model has all outputs. (If f is orthogonal, bounds are those of a free f, but steps are not.)
+        self.together = self.prior.shared or problem.orthogonal
         self.feature_map = data.maps.feature_map
-        self.columns = columns_of(self.feature_map, _sample(data, _SEEN_ROWS)[0], theta)
+        self.columns = columns_of(self.feature_map, _sample(data, _SEEN_ROWS)[0], len(theta))
         self.sample, targets = _sample(data, _START_ROWS)
         self.targets = targets - problem.units.target_mean
         # z of the last features of the sample.
@@ -234,7 +274,7 @@ class _Calibrator:
         for o, variance in enumerate(noise):
             H = features if features.ndim == 2 else features[:, o]
             r = self.targets[:, o] - H[:, : self.p] @ prior.mean[o]
-            likelihoods.append(WeightLikelihood(H.T @ H / variance, H.T @ r / variance, float(r @ r / variance)))
+            likelihoods.append(likelihood_of_whitened(H / np.sqrt(variance), r / np.sqrt(variance)))
         return theta_step(likelihoods, prior, columns, z)
 
     def residual_variance(self, step: ThetaStep) -> np.ndarray:
@@ -254,10 +294,15 @@ class _Calibrator:
     def starts(self, seed: int) -> list[ThetaStep]:
         """Different optima of the features alone, the best one first."""
         q = len(self.theta)
-        tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(int(np.ceil(np.log2(_TRIED * q)))))
+        n_tried = sum(_TRIED_BROAD if prior.broad else _TRIED_NARROW for prior in self.theta.priors)
+        tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(int(np.ceil(np.log2(n_tried)))))
         squares = np.mean(self.targets**2, axis=0)
         first = self.alone(np.zeros(q), np.where(squares > 0.0, squares, 1.0))
-        assert first is not None
+        if first is None:
+            raise ValueError(
+                f"The features or their derivatives in the parameters {list(self.theta.names)} are NaN or infinite at "
+                "the prior medians."
+            )
         noise = self.residual_variance(first)
         found = [self.improved(np.zeros(q), noise)]
         values = [self.value_alone(z, noise) for z in tried]
@@ -316,17 +361,21 @@ class _Calibrator:
     def covariance_of_best_fit(self, step: ThetaStep, fitted: FitOfTheta) -> np.ndarray:
         """The posterior covariance (q, q) of z if f is orthogonal to the features."""
         # z is then that of the best fit in least squares, where the gradient s(z) = σ⁻² Jᵀ (y - h(z)) - z is 0. The
-        # residuals contain f and may be large, so that Gauss and Newton's s' = -Λ (see `ThetaStep.precision`) is not
-        # good enough. As Var[s] is Λ to first order, the covariance is (s')⁻¹ Λ (s')⁻ᵀ (White 1982).
-        std, slopes = np.sqrt(np.diagonal(np.linalg.inv(step.precision))), []
-        for direction, size in zip(np.eye(len(std)), _DIFFERENCE * std, strict=True):
-            ends = [self.step_at(fitted, step.z + sign * size * direction, step) for sign in (1.0, -1.0)]
+        # residuals contain f and may be large, so that Gauss and Newton's s' = -Λ = -(L Lᵀ)⁻¹ is not good enough. As
+        # Var[s] is Λ to first order, the covariance is (s')⁻¹ Λ (s')⁻ᵀ = L (AᵀA)⁻¹ Lᵀ with A = -Lᵀ s' L (White 1982).
+        deviation = step.deviation()
+        L, columns = deviation.W * deviation.widths, []
+        for direction in L.T:
+            ends = [self.step_at(fitted, step.z + sign * _DIFFERENCE * direction, step) for sign in (1.0, -1.0)]
             if ends[0] is None or ends[1] is None:
-                return np.linalg.inv(step.precision)
+                return deviation.covariance
             forward, back = (end.gradient.sum(axis=0) - end.z for end in ends if end is not None)
-            slopes.append((forward - back) / (2.0 * size))
-        slope_inv = np.linalg.pinv(np.array(slopes).T)
-        return slope_inv @ step.precision @ slope_inv.T
+            columns.append(L.T @ (back - forward) / (2.0 * _DIFFERENCE))
+        _, sizes, Wt = np.linalg.svd(np.array(columns).T)
+        if sizes.min() < _FLAT:
+            return deviation.covariance
+        LA = L @ (Wt.T / sizes)
+        return LA @ LA.T
 
 
 def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
@@ -350,7 +399,7 @@ def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
 
 def _length(move: np.ndarray, step: ThetaStep) -> float:
     """The largest component of a step, in posterior standard deviations."""
-    return float(np.max(np.abs(move) / np.sqrt(np.diagonal(np.linalg.inv(step.precision)))))
+    return float(np.max(np.abs(move) / step.deviation().std))
 
 
 def _values_or_nan(function: Callable[[Any], Any], rows: Any) -> np.ndarray:
@@ -399,7 +448,8 @@ def calibrate(
     for start in starts if len(starts) > 1 else ():
         rough = fit(own.problem_at(start, own.data_at(start.z)), None, True)
         start = own.settled(start, rough)
-        bound = own.finished(start, own.data_at(start.z), rough).lower_bound - 0.5 * float(start.z @ start.z)
+        bound = own.finished(start, own.data_at(start.z), rough).lower_bound
+        bound -= 0.0 if own.together else start.counted_twice()
         if best is None or bound > best[0]:
             best = bound, start, rough
             _, step, fitted = best
@@ -412,7 +462,9 @@ def calibrate(
     at_mode = own.data_at(step.z)
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
-    posterior = ThetaPosterior.of(found, step)
+    posterior = ThetaPosterior.of(found, step, own.together)
+    if _length(step.newton(), step) > _MOVED:
+        posterior = replace(posterior, mean=step.z)
     if problem.orthogonal:
         posterior = replace(posterior, covariance=own.covariance_of_best_fit(step, fitted))
     return Calibration(at_mode, own.problem_at(step, at_mode), own.finished(step, at_mode, fitted), posterior)
@@ -426,4 +478,5 @@ def after_more_rows(
     prior = restricted(fitted.prior, p)
     z = posterior.theta.coordinates()
     step = theta_step(fitted.weight_likelihoods(), prior, linearized.columns, z)
-    return ThetaPosterior.of(posterior.theta, step), fitted.reweighted(extended(prior, step))
+    together = prior.shared or fitted.models[0].sparse.orthogonal
+    return ThetaPosterior.of(posterior.theta, step, together), fitted.reweighted(extended(prior, step))

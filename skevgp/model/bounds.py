@@ -100,7 +100,8 @@ class Group:
         for output, signal in enumerate(self.signal):
             C = self.prior.roots()[output]
             AA, AV = C.T @ statistics.HH @ C, C.T @ statistics.VH.T
-            found.append(np.sqrt(signal) * (semidefinite_inverse(AA) @ AV))
+            sizes = np.square(C).T @ diagonal_of(statistics.HH)
+            found.append(np.sqrt(signal) * (semidefinite_inverse(AA, sizes) @ AV))
         return found
 
     def orthogonalised(self, index: int, crossed: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,6 +121,15 @@ class Group:
         PP = np.multiply.outer(scales, scales)
         PP *= statistics.joint
         return PP, scales * sums
+
+    def sizes(self, index: int) -> np.ndarray | None:
+        """The diagonal (m + p,) of B of an output if no terms cancelled. None: they do not."""
+        # V⊥ V⊥ᵀ is a difference, and so are features times correlated C: rounding errors of V Vᵀ and HᵀH stay.
+        if self.prior.root is None and not self.orthogonal:
+            return None
+        of_V = self.signal[index] * diagonal_of(self.statistics.VV)
+        of_H = np.square(self.prior.roots()[index]).T @ diagonal_of(self.statistics.HH)
+        return 1.0 + np.concatenate([of_V, of_H]) / self.noise[index]
 
 
 # --- the optimal posterior --------------------------------------------------------------------------------------------
@@ -161,7 +171,7 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
             diagonal_of(B)[...] += 1.0
             g /= noise
             g[m:] -= group.prior.reference[o]
-            root = jittered_cholesky(B)
+            root = jittered_cholesky(B, sizes=group.sizes(o))
             root_inv = triangular_inverse(root)
             own.append(WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g), len(B)))
         found.append(own)
@@ -191,7 +201,7 @@ def _with_shared_weights(groups: Sequence[Group]) -> list[list[WhitenedPosterior
             PP /= noise
             g /= noise
             diagonal_of(PP)[:m] += 1.0
-            D_root = jittered_cholesky(PP[:m, :m])
+            D_root = jittered_cholesky(PP[:m, :m], sizes=None if (of_B := group.sizes(o)) is None else of_B[:m])
             D_root_inv = triangular_inverse(D_root)
             A, z = D_root_inv @ PP[:m, m:], D_root_inv @ g[:m]
             S += PP[m:, m:] - A.T @ A

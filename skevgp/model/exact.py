@@ -43,6 +43,7 @@ from .bounds import LOG_2PI
 from .parameters import ParameterTable, Values, log_prior
 from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
+from .weights import WeightLikelihood, likelihood_of_whitened
 
 
 class OutputGivenKernel:
@@ -264,6 +265,14 @@ class ExactModel:
             return np.zeros(len(noise))
         constant = float((w - 1.0) @ (LOG_2PI + np.log(w / self.rows.precision)) + np.log(w).sum())
         return -0.5 * (constant + (self.rows.total - len(self.rows.inputs)) * np.log(noise))
+
+    def weight_likelihoods(self, values: Values) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, with f integrated out."""
+        found = []
+        for index, output in enumerate(self.outputs(values)[1]):
+            rows, root_inv = self.rows.of(slice(index, index + 1)), output.L_inv / np.sqrt(output.signal)
+            found.append(likelihood_of_whitened(root_inv @ rows.features, root_inv @ rows.targets[:, 0]))
+        return found
 
     def predictor(self, values: Values) -> Predictor:
         """The predictor in internal units. Its inducing points are the rows."""

@@ -68,10 +68,12 @@ def jittered_cholesky(
             raise NotPositiveDefiniteError(f"not positive definite with a relative jitter of {most}")
 
 
-def semidefinite_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (n, n) of a symmetric positive semi-definite matrix, in units of its diagonal."""
-    sizes = np.sqrt(np.maximum(diagonal_of(matrix), 0.0))
-    by = np.where(sizes > 0.0, sizes, 1.0)
+def semidefinite_inverse(matrix: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse (n, n) of a symmetric positive semi-definite matrix.
+
+    Directions that are small next to ``sizes`` (n,), the diagonal without cancellation of terms, are left out.
+    """
+    by = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
     values, vectors = np.linalg.eigh(matrix / np.multiply.outer(by, by))
     kept = values > _NO_DIRECTION * max(values.max(initial=0.0), np.finfo(float).tiny)
     root = vectors[:, kept] / np.sqrt(values[kept]) / by[:, np.newaxis]

@@ -6,7 +6,10 @@ from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.features import ParametricFeatures, Uniform
 from skevgp.solvers import LBFGS
+
+from ..theta import rows_of_three
 
 N_OUTPUTS, D = 3, 2
 QUICK = {"max_iter": 10, "solver": LBFGS(tol=1e6), "random_state": 0}
@@ -52,5 +55,6 @@ MODELS = {
         FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), n_inducing=20
     ),
     "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), n_inducing=20),
+    "parameters": EVGPRegressor(ParametricFeatures(rows_of_three, {"scale": Uniform(0.5, 3.0)}), n_inducing=10),
     "exact": EGPRegressor(PolynomialFeatures(1)),
 }

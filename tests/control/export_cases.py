@@ -8,9 +8,11 @@ from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
-from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
+from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics, ParametricFeatures, Uniform
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
+
+from ..theta import WAVE, rows_of_three
 
 
 class Rows(TransformerMixin, BaseEstimator):
@@ -71,6 +73,9 @@ MODELS = {
     "student-t": sparse(POLYNOMIAL, noise="student-t"),
     "all rows": sparse(n_inducing=80, kernel=sk.RBF(0.5)),
     "sums": sparse(kernel=2.0 * sk.Matern(1.0, nu=1.5) + sk.DotProduct(0.5) + sk.WhiteKernel(0.1), noise="gaussian"),
+    "parameters": sparse(make_union(WAVE, StandardScaler())),
+    "parameters, rows": sparse(ParametricFeatures(rows_of_three, {"scale": Uniform(0.5, 3.0)})),
+    "parameters, orthogonal f": exact(WAVE, discrepancy="orthogonal"),
     "exact": exact(),
     "exact, features": exact(POLYNOMIAL, normalize_y=True),
     "exact, shared weights": exact(Rows(), coef_prior=CoefPrior(shared=True)),

@@ -18,6 +18,8 @@ from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
+from ..theta import WAVE
+
 N_STEPS = 12
 QUICK = {"max_iter": 20, "solver": LBFGS(tol=1e6), "random_state": 0}
 
@@ -44,6 +46,8 @@ REGRESSORS = {
     "sparse": EVGPRegressor(n_inducing=15, **QUICK),
     "features": EVGPRegressor(FunctionTransformer(), kernel_map=StandardScaler(), n_inducing=15, **QUICK),
     "exact": EGPRegressor(FunctionTransformer(), random_state=0, max_iter=20, tol=1e6),
+    "parameters": EVGPRegressor(WAVE, n_inducing=15, **QUICK),
+    "residual of parameters": ResidualRegressor(EVGPRegressor(WAVE, n_inducing=15, **QUICK)),
     "residual": ResidualRegressor(EVGPRegressor(n_inducing=15, **QUICK)),
     "scikit-learn's": GaussianProcessRegressor(RBF(2.0) + WhiteKernel(1e-3), normalize_y=True, optimizer=None),
     "pipeline": make_pipeline(StandardScaler(), EVGPRegressor(n_inducing=15, **QUICK)),

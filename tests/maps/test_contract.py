@@ -42,6 +42,8 @@ from skevgp.features.robot_map import RobotTransformer
 from skevgp.maps import ADAPTERS, NoExpressionError, as_map
 from skevgp.maps.theta import LinearizedFeatures, Theta, theta_jacobian
 
+from ..theta import DECAY, PRIORS, WAVE, rows_of_outputs, wave_and_slope
+
 TERMS = ["acceleration", "gravity", "bias", "input"]
 MASK = np.array([False, True, False, False, True])
 
@@ -235,12 +237,31 @@ LINEARIZED = {
 }
 PHYSICS |= {"friction, no robot": (Friction(), 4), "friction": (Friction("acrobot"), 5), **LINEARIZED}
 PHYSICS["function of parameters"] = WITH_PARAMETERS["function"]
+LINEAR = np.array([[0, 0], [0, 1], [2, 1]])
+THETA = {
+    "parametric": (WAVE, 2),
+    "parametric, rows": (ParametricFeatures(rows_of_outputs, PRIORS), 2),
+    "parametric, in a pipeline": (make_pipeline(StandardScaler(), WAVE, PolynomialFeatures(2)), 2),
+    "parametric, by differences": (ParametricFeatures(wave_and_slope, PRIORS, derivatives="differences"), 2),
+    "linearised": (LinearizedFeatures(make_union(WAVE, StandardScaler()), LINEAR[:2]), 2),
+    "linearised, rows": (LinearizedFeatures(ParametricFeatures(rows_of_outputs, PRIORS), LINEAR[:2]), 2),
+    "linearised, nested": (
+        LinearizedFeatures(
+            FeatureUnion(
+                [("a", WAVE), ("b", make_pipeline(StandardScaler(), DECAY, MinMaxScaler()))],
+                transformer_weights={"a": 2.0},
+            ),
+            np.array([[0, 1], [1, 2]]),
+        ),
+        2,
+    ),
+}
 TIMED = {
     f"{kind.__name__}, {robot}, time step": (kind(robot, dt="column"), n_columns)
     for kind in (AngleEncoder, Friction, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics)
     for robot, n_columns in (("pendulum", 4), ("acrobot", 6), ("iiwa14", 22))
 }
-CASES = {**{name: (transformer, 5) for name, transformer in SKLEARN.items()}, **PHYSICS, **TIMED}
+CASES = {**{name: (transformer, 5) for name, transformer in SKLEARN.items()}, **PHYSICS, **THETA, **TIMED}
 # Those that are not, or not wholly, known, so that differences or `transform` are asked.
 BY_DIFFERENCES = {
     "spline, broken lines that go on",
@@ -257,6 +278,8 @@ BY_DIFFERENCES = {
     "rows, at the end",
     "rows, in the middle",
     *LINEARIZED,
+    "parametric, by differences",
+    *(name for name in THETA if name.startswith("linearised")),
 }
 WITHOUT_EXPRESSION = {
     "function": "cannot be written in CasADi, as functions of NumPy",
@@ -304,7 +327,10 @@ def name(request):
 
 @pytest.fixture
 def transformer(name):
-    return deepcopy(CASES[name][0]).fit(rows_of(name, 40, seed=1))
+    transformer, X = deepcopy(CASES[name][0]), rows_of(name, 40, seed=1)
+    if isinstance(transformer, LinearizedFeatures):
+        transformer.feature_map.fit(X)
+    return transformer.fit(X)
 
 
 def test_every_adapter_has_a_case():
@@ -316,12 +342,14 @@ def test_every_adapter_has_a_case():
 
     tried = {kind for transformer, _ in CASES.values() for kind in kinds(transformer)}
     # A subclass of each is there.
-    assert set(ADAPTERS) - tried == {RobotTransformer, LinearizedFeatures}
+    assert set(ADAPTERS) - tried == {RobotTransformer}
 
 
 def test_value_is_that_of_transform(name, transformer):
     X = rows_of(name)
-    rounded = name.startswith(("pca", "svd", "pipeline", "union", "columns", "own", "rows"))
+    rounded = name.startswith(
+        ("pca", "svd", "pipeline", "union", "columns", "own", "rows", "linearised, nested", "parametric, in")
+    )
     for some in (X, X[:1]):
         close(as_map(transformer).value(some), transformer.transform(some), 1e-12 if rounded else 0.0)
 
