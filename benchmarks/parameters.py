@@ -7,8 +7,8 @@
     python benchmarks/parameters.py pendulum --quick               # one seed, few rows: seconds
 
 *pendulum*: a simulated pendulum of 1 kg with viscous and Stribeck friction, four trajectories of 100 steps of 0.03 s,
-changes of the velocity with 1 % noise. Medians of the priors are 20 % off. "learned" has a `ParametricFeatures` of one
-step of Runge and Kutta's rule with four parameters. "fixed, 20 % off" has the same function with all parameters too
+changes of the velocity with 1 % noise. Medians of the priors are 20 % off. "learned" has a `ParametricFeatures` of four
+steps of Runge and Kutta's rule with four parameters. "fixed, 20 % off" has the same function with all parameters too
 large by 20 %, "fixed, right" with the true ones. With a ripple, the motor has a torque that depends on the angle, which
 the function does not know. Errors are those of four other trajectories.
 
@@ -86,7 +86,7 @@ def swing(
 
 def velocity_change(X: Any, **theta: Any) -> Any:
     """Return the physics of the models: the change of q̇ in a step, (n, 1)."""
-    return change(partial(swing, ripple=0.0, **theta), X, STEP)[1].reshape(-1, 1)
+    return change(partial(swing, ripple=0.0, **theta), X, STEP, n_steps=4)[1].reshape(-1, 1)
 
 
 def trajectories(rng: np.random.Generator, ripple: float, n: int, n_steps: int = 100) -> tuple[np.ndarray, np.ndarray]:
