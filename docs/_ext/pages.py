@@ -35,7 +35,7 @@ LINK = re.compile(r"(!?)\[([^\[\]]*)\]\((?!https?:|#)([^)#\s]+)(#[^)]*)?\)")
 # Pages of the site that stand for files of the repository.
 PAGES = {"README.md": "/index", "REPRODUCTION.md": "/reproduction", "CHANGELOG.md": "/changelog"}
 # What public functions return, and users therefore meet.
-RETURNED = {"skevgp.control.compiled": ["CompiledPredictor"]}
+RETURNED = {"skevgp.control.compiled": ["CompiledPredictor"], "skevgp.control.acados": ["L4acadosModel"]}
 
 
 def write(path: Path, text: str) -> None:

@@ -24,7 +24,8 @@ class CompiledPredictor:
     """A fitted model for control loops, as `EVGPRegressor.compile` returns it.
 
     Predictions equal those of ``predict`` up to rounding. Rows are not validated: pass finite float64 arrays with the
-    columns of `fit` and at least one row. Threads may share the object, and it can be pickled.
+    columns of `fit` and at least one row. Threads may share the object, and it can be pickled. For L4acados, use
+    `EVGPRegressor.to_l4acados`.
 
     Parameters
     ----------
@@ -47,20 +48,6 @@ class CompiledPredictor:
     >>> mean, std = fast.predict(np.array([1.0]), return_std=True)
     >>> mean.shape, fast.value_and_jacobian(X)[1].shape
     ((2,), (60, 2, 1))
-
-    A ``ResidualModel`` of L4acados has Jacobians with the axis of outputs first. Its zero-order controller reads the
-    variances of the last rows:
-
-    >>> class LearnedResidual:  # or a subclass of l4acados.models.ResidualModel
-    ...     def __init__(self, model):
-    ...         self.model = model
-    ...
-    ...     def value_and_jacobian(self, y):
-    ...         mean, jacobian, std, _ = self.model.value_and_jacobian(y, return_std=True)
-    ...         self.current_variance = std.reshape(len(y), -1) ** 2
-    ...         return mean.reshape(len(y), -1), jacobian.reshape(len(y), -1, y.shape[1]).swapaxes(0, 1)
-    >>> LearnedResidual(fast).value_and_jacobian(X)[1].shape
-    (2, 60, 1)
     """
 
     _state: _State

@@ -21,6 +21,7 @@ from ..maps import as_map, as_maps
 from ..model.predictor import Predictor
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted, check_integer
+from .acados import L4acadosModel, checked_columns
 from .c_code import write_c
 from .casadi import Exported, with_base
 from .compiled import CompiledPredictor
@@ -284,6 +285,45 @@ class Posterior:
         array([1.])
         """
         return CompiledPredictor(self.predictor, *as_maps(self.maps), include_noise, self.base)
+
+    def to_l4acados(self, columns: ArrayLike | None = None, *, include_noise: bool = True) -> L4acadosModel:
+        """Make a residual model for the controllers of L4acados, which plan with acados.
+
+        Fit the model to rows [x, u] and the residual that a nominal model of the next state leaves, x' - f(x, u), or
+        some of its columns. The argument ``B`` of the controller maps these to the state. L4acados is not imported.
+
+        Parameters
+        ----------
+        columns : array-like of shape (n_features,), default=None
+            Indices of the columns of [x, u] that the model was fitted to, in its order. If None, it was fitted to all.
+        include_noise : bool, default=True
+            Whether variances are those of y, with the learned noise, or those of the noise-free g(x).
+
+        Returns
+        -------
+        residual_model : L4acadosModel
+            It has ``value_and_jacobian``, ``evaluate``, ``jacobian`` and ``current_variance``, in L4acados' shapes. Its
+            method ``update(model)`` copies the weights after a ``partial_fit``.
+
+        Raises
+        ------
+        NotFittedError
+            If the model is not fitted.
+        ValueError
+            If X had columns that are not numbers, or if ``columns`` are not different indices, one for each column.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import EVGPRegressor
+        >>> XU = np.random.RandomState(0).uniform(-1.0, 1.0, (60, 3))  # two states and an input
+        >>> model = EVGPRegressor(n_inducing=10, random_state=0).fit(XU[:, :2], -0.1 * np.sin(XU[:, 0]))
+        >>> residual = model.to_l4acados(columns=[0, 1])
+        >>> value, jacobian = residual.value_and_jacobian(XU[:20])
+        >>> value.shape, jacobian.shape
+        ((20, 1), (1, 20, 3))
+        """
+        return L4acadosModel(self.compile(include_noise), checked_columns(columns, self.maps.n_columns))
 
     def sample_functions(
         self, n: int = 1, random_state: int | np.random.RandomState | None = 0, *, n_waves: int = 3000

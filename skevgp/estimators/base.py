@@ -197,6 +197,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     to_casadi = delegate("to_casadi")
     to_casadi_parameters = delegate("to_casadi_parameters")
     to_c = delegate("to_c")
+    to_l4acados = delegate("to_l4acados")
 
     def summary(self) -> ModelSummary:
         """Summarise the fit: kernel, noise, bounds on the likelihood, and weights with their prior.

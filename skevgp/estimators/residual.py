@@ -226,6 +226,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
     to_casadi = _delegate("to_casadi")
     to_casadi_parameters = _delegate("to_casadi_parameters")
     to_c = _delegate("to_c")
+    to_l4acados = _delegate("to_l4acados")
 
     @property
     def _posterior(self) -> Posterior | None:
