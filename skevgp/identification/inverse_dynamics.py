@@ -75,8 +75,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Whether to move the weights to the most probable physical ones (masses above 0, positive definite
         pseudo-inertias). Covariances and noise do not change.
     stiction_velocity : "auto" or None, default="auto"
-        If ``"auto"``, find the speed above which the sign of friction of each joint is known, which needs at least
-        three ``groups``. If None, use that of `RigidBodyRegressor`.
+        If ``"auto"``, find the velocity v_s of the mean friction :math:`F \tanh(\dot q / v_s)` of each joint with its
+        uncertainty (``theta_``). If None, use that of `RigidBodyRegressor`.
     learn_scales : bool, default=True
         Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
@@ -103,6 +103,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
         Prior means and learned prior standard deviations of β. Torques do not determine a weight whose standard
         deviation is still that of the prior.
+    theta_, theta_std_ : dict of str to float
+        Posterior medians of the v_s of mean friction :math:`F \tanh(\dot q / v_s)`, rad/s or m/s, and their standard
+        deviations to first order, such as ``theta_["stiction_velocity(q1)"]``. Empty if they are not found.
     gains_, gains_std_ : ndarray of shape (n_outputs,)
         Gains 1 + c and their standard deviations. Torques of the model times gains are those of y.
     noise_variance_ : ndarray of shape (n_outputs,)
@@ -301,7 +304,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         doubts = []
         if self._has_robot:
             doubts = [doubt] if (doubt := self._doubt(rows_x, targets, is_doubtful)) else []
-            doubts += weaknesses(rows, self._weights, self._outputs)
+            doubts += weaknesses(rows, self._weights, len(self._names(targets.shape[1])), self._outputs)
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()
         return doubts
@@ -311,7 +314,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         is_far = self._weights.surprise > _FAR or bool(self._unexplained)
         causes: list[str] = []
         if is_far or is_doubtful:
-            prior, size = self._weights.prior, self._weights.n_weights
+            prior, size = self._weights.prior, len(self._names(y.shape[1]))
             own = prior.mean[:size], prior.covariance[:size, :size]
             causes = likely_causes(self.feature_map_, X, y, own, is_far=is_far)
         if not is_far and not causes:
@@ -364,14 +367,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     def _set_attributes(self) -> None:
         weights, n_outputs = self._weights, len(self._joints)
-        p = weights.n_weights
+        p, n = len(self._names(n_outputs)), weights.n_weights
         std = np.sqrt(np.maximum(np.diag(weights.covariance), 0.0))
         self.coef_, self.coef_std_, self.coef_cov_ = weights.mean[:p], std[:p], weights.covariance[:p, :p]
         self.coef_names_ = self._names(n_outputs)
+        self.theta_, self.theta_std_ = ({}, {}) if self._theta is None else self._theta.attributes()[:2]
         self.coef_prior_mean_ = weights.prior.mean[:p]
         self.coef_prior_scale_ = np.sqrt(np.diag(weights.prior.covariance)[:p])
         self.gains_ = weights.gains(n_outputs)
-        self.gains_std_ = std[p:] if len(std) > p else np.zeros(n_outputs)
+        self.gains_std_ = std[n:] if len(std) > n else np.zeros(n_outputs)
         noise = [joint.noise for joint in self._joints]
         self.noise_variance_ = np.array([one.variance for one in noise])
         self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])

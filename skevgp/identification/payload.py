@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from sklearn.utils import Bunch
 
-from .weights import Known, Prior, Rows, identify
+from .weights import Known, Prior, Rows, identify, with_others
 
 # Half width of the 95 % interval of a normal distribution, in standard deviations.
 _95 = 1.959963984540054
@@ -18,14 +18,8 @@ def payload_prior(prior: Prior, mass_scale: float, size: float) -> Prior:
     """Add a body with ten nearly unknown parameters to the prior of a robot, between its weights and its gains."""
     # The mass has mean 0 and standard deviation mass_scale (kg). First moments have size (m) times that, and moments of
     # inertia size² times that.
-    p, total = len(prior.scaled), len(prior.mean)
-    robot = np.concatenate([np.arange(p), np.arange(p + 10, total + 10)])
-    mean, covariance = np.zeros(total + 10), np.zeros((total + 10, total + 10))
-    mean[robot] = prior.mean
-    covariance[np.ix_(robot, robot)] = prior.covariance
     body = mass_scale * np.concatenate([[1.0], np.full(3, size), np.full(6, size**2)])
-    covariance[range(p, p + 10), range(p, p + 10)] = body**2
-    return replace(prior, mean=mean, covariance=covariance, scaled=np.append(prior.scaled, np.ones(10, dtype=bool)))
+    return with_others(prior, body**2, scaled=True)
 
 
 def find_payload(

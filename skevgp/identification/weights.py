@@ -53,10 +53,11 @@ class Prior:
     velocity: np.ndarray  # (o,) speed below which friction has no sign
     # (P,): labels of groups whose standard deviations are learned. They are independent of each other. Empty: it stays.
     groups: np.ndarray | None = None
+    learned: bool = False  # whether standard deviations are learned already, and stay
 
     def scaled_by(self, factors: np.ndarray) -> Prior:
         """Return the prior with standard deviations times factors (P,), which then stay."""
-        return replace(self, covariance=self.covariance * np.outer(factors, factors), groups=None)
+        return replace(self, covariance=self.covariance * np.outer(factors, factors), learned=True)
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,11 @@ class Weights:
     def predict(self, features: np.ndarray) -> np.ndarray:
         """Return the mean (n, o) for features (n, o, p)."""
         return _forward(features, self.mean, self.prior)
+
+    def with_others(self, q: int) -> Weights:
+        """Return a start for a prior with q more weights (`with_others`), which are 0."""
+        at = [self.n_weights] * q
+        return replace(self, mean=np.insert(self.mean, at, 0.0), factors=np.insert(self.factors, at, 1.0))
 
     def given(self, first: np.ndarray) -> Weights:
         """Return the posterior with the first weights set, and the others at their conditional mean."""
@@ -248,7 +254,7 @@ class _Problem:
     def _next_factors(self, state: _State, squares: np.ndarray) -> np.ndarray:
         """Return the factors (P,) after a step of expectation maximisation, given E[z²] (P,)."""
         factors = state.factors.copy()
-        if self.prior.groups is None:
+        if self.prior.groups is None or self.prior.learned:
             return factors
         for group in dict.fromkeys(self.prior.groups):
             if group:
@@ -298,6 +304,22 @@ def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:
     covariance[-n_outputs:, -n_outputs:] = scale**2 * np.eye(n_outputs)
     groups = None if prior.groups is None else np.concatenate([prior.groups, [""] * n_outputs])
     return replace(prior, mean=mean, covariance=covariance, groups=groups)
+
+
+def with_others(prior: Prior, variances: np.ndarray, *, scaled: bool = False) -> Prior:
+    """Add independent weights with mean 0 between the weights and the gains."""
+    p, q = len(prior.scaled), len(variances)
+    kept = np.concatenate([np.arange(p), np.arange(p + q, len(prior.mean) + q)])
+    covariance = np.zeros((len(prior.mean) + q, len(prior.mean) + q))
+    covariance[np.ix_(kept, kept)] = prior.covariance
+    covariance[range(p, p + q), range(p, p + q)] = variances
+    return replace(
+        prior,
+        mean=np.insert(prior.mean, [p] * q, 0.0),
+        covariance=covariance,
+        scaled=np.append(prior.scaled, np.full(q, scaled)),
+        groups=None if prior.groups is None else np.insert(prior.groups, [p] * q, ""),
+    )
 
 
 def _forward(features: np.ndarray, mean: np.ndarray, prior: Prior) -> np.ndarray:
