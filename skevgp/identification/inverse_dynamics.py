@@ -80,7 +80,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     learn_scales : bool, default=True
         Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
-        it. Factors are from 1e-4 to 1e4.
+        it. Factors are from 1e-4 to 1e4. With ``gain_scale``, that of inertial parameters is at least 1: torques do
+        not show a common error of masses and gains.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -147,14 +148,14 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     Notes
     -----
-    Weights are fitted first by Bayesian regression, together with noise, static friction and gains. Filtered rows count
-    less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a training row is
-    predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as large as the
-    residuals, and its length scales are at most three standard deviations of their column and, except that of the
-    speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn. Weights
-    and f_j are then fitted again. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that errors
-    fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j fades.
-    Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
+    Weights are fitted first by Bayesian regression, together with noise, static friction, its velocities and gains.
+    Filtered rows count less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a
+    training row is predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as
+    large as the residuals, and its length scales are at most three standard deviations of their column and, except that
+    of the speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn.
+    Weights and f_j are then fitted again. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that
+    errors fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j
+    fades. Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
 
     References
     ----------
