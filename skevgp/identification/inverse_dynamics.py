@@ -29,7 +29,7 @@ from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
 from .log_check import check_of
-from .moves import FEWEST_MOVES, MoveEffects, of_move, terms
+from .moves import FEWEST_MOVES, MoveEffects, of_move
 from .rows_of_logs import evenly_spread
 from .weaknesses import weaknesses
 from .weights import Fold, Rows, condensed, folds
@@ -291,7 +291,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         with ignored(category=RobotModelWarning):  # given already
             self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)
-        self._known, self._n_moves = condensed(rows, self._weights), rows.n_moves
+        self._n_moves = rows.n_moves
         if self.consistent and self._has_robot:
             size = 10 * targets.shape[1]
             start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
@@ -307,6 +307,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             doubts = [doubt] if (doubt := self._doubt(rows_x, targets, is_doubtful)) else []
             doubts += weaknesses(rows, self._weights, len(self._names(targets.shape[1])), self._outputs)
         self._joints = self._residuals(rows_x, rows)
+        self._known = condensed(rows, self._weights, self._effects(self._weights.predict(rows.features), rows.speed))
         self._set_attributes()
         return doubts
 
@@ -435,11 +436,6 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
                 mean[:, j] += more
                 variance[:, j] += uncertain
         return mean, variance
-
-    def _terms(self, physics: np.ndarray, speed: np.ndarray) -> list[np.ndarray]:
-        """Return z of each joint, (n, 4)."""
-        columns = zip(self._joints, speed.T, physics.T, strict=True)
-        return [terms(v, torque, joint.noise.velocity) for joint, v, torque in columns]
 
     def _noise(self, speed: np.ndarray) -> np.ndarray:
         """Return the variance of the noise, (n, o)."""

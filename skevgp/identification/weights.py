@@ -181,16 +181,30 @@ class Known(NamedTuple):
     targets: np.ndarray  # (p + 1, o)
 
 
-def condensed(rows: Rows, weights: Weights) -> Known:
+def condensed(rows: Rows, weights: Weights, effects: np.ndarray | None = None) -> Known:
     """Condense rows to the triangular factor of the whitened [H y] of each output."""
+    # effects (n, o, k) are columns whose weights are N(0, I), independent for each output and each move (``groups``).
+    # They are integrated out: the QR factorisation of [E H y; I 0 0] leaves, below the rows of E, the factor of the
+    # marginal likelihood.
     _, n_outputs, p = rows.features.shape
     scale = np.sqrt(weights.inflation * weights.correlation_time * _variances(weights.noise, rows.speed))
     features, targets = np.zeros((p + 1, n_outputs, p)), np.zeros((p + 1, n_outputs))
+    moves = [rows.groups == move for move in np.unique(rows.groups)]
     for o in range(n_outputs):
         whole = np.column_stack([rows.features[:, o], rows.targets[:, o]]) / scale[:, o : o + 1]
+        if effects is not None:
+            own = effects[:, o] / scale[:, o : o + 1]
+            whole = np.concatenate([_without(own[move], whole[move]) for move in moves])
         factor = np.asarray(np.linalg.qr(whole, mode="r"))
         features[: len(factor), o], targets[: len(factor), o] = factor[:, :p], factor[:, p]
     return Known(features, targets)
+
+
+def _without(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return fewer rows with the likelihood of rows (n, m) with unit noise after columns (n, k) are integrated out."""
+    k = columns.shape[1]
+    whole = np.block([[columns, rows], [np.eye(k), np.zeros((k, rows.shape[1]))]])
+    return np.asarray(np.linalg.qr(whole, mode="r"))[k:, k:]
 
 
 @dataclass(frozen=True)

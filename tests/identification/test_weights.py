@@ -131,3 +131,22 @@ def test_surprise_is_that_of_the_prior_as_given_after_more_rounds():
     first = identify(rows, prior)
     again = identify(rows, first.prior, start=first)
     assert again.surprise == pytest.approx(first.surprise, rel=0.02)
+
+
+def test_effects_of_moves_are_integrated_out():
+    rows, prior, beta = problem(n=60, n_outputs=1)
+    weights = identify(rows, prior)
+    effects = np.random.default_rng(1).normal(size=(60, 1, 2))
+    known = condensed(rows, weights, effects)
+    scale = weights.inflation * weights.correlation_time[0] * weights.noise[0].variance
+    covariance = scale * np.eye(60)
+    for move in np.unique(rows.groups):
+        own = rows.groups == move
+        covariance[np.ix_(own, own)] += effects[own, 0] @ effects[own, 0].T
+
+    def square(some):
+        error = rows.targets[:, 0] - rows.features[:, 0] @ some
+        return error @ np.linalg.solve(covariance, error)
+
+    for some in (beta, beta + 0.3):
+        assert np.sum((known.targets - known.features @ some) ** 2) == pytest.approx(square(some), rel=1e-8)
