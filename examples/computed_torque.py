@@ -1,7 +1,7 @@
-"""A simulated arm with a payload and friction that its model does not know, and a computed-torque controller.
+"""A simulated arm with an unknown payload and unknown friction, and a computed-torque controller.
 
-What `plot_tracking.py` and `benchmarks/control.py` share. Trajectories are arrays of shape (n_steps, n_runs,
-3 * n_joints) with rows [q, q̇, q̈]; all runs are simulated at once.
+`plot_tracking.py` and `benchmarks/control.py` use this module. Trajectories are arrays of shape (n_steps, n_runs,
+3 * n_joints) with rows [q, q̇, q̈]. All runs are simulated together.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from skevgp.datasets import load_robot, perturb_robot, quintic_reference
 from skevgp.features import RigidBodyRegressor
 from skevgp.robots import RigidBody
 
-# Of the controller, s. The simulator takes five steps of Runge and Kutta's method in it, for friction is stiff.
+# Time step of the controller, s. The simulator divides it into five Runge-Kutta steps, because friction is stiff.
 DT, SUBSTEPS = 0.005, 5
 KP, KD = 100.0, 20.0
 HOME = np.array([0.0, 0.8, 0.0, -1.2, 0.0, 0.8, 0.0])
-# Of what is logged, every so many steps: 50 Hz.
+# The log has every fourth state: 50 Hz.
 EVERY = 4
-# Of moves, rad/s, and s: no faster and no slower.
+# Largest speed of a move, rad/s, and its longest duration, s.
 FASTEST, SLOWEST = 2.2, 5.0
-# Where a move's torques are looked at before it runs.
+# Times of a move at which its torques are checked in advance.
 INSTANTS = np.linspace(0.0, 1.0, 51)
 
 

@@ -1,6 +1,6 @@
-"""Model predictive control on a learned model: iLQR with a limit on the input, planned anew at each step.
+"""Model predictive control on a learned model: iLQR with a limit on the input, and a new plan at each step.
 
-What `plot_swing_up.py` and `benchmarks/control.py` share.
+`plot_swing_up.py` and `benchmarks/control.py` use this module.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from skevgp.datasets import make_dynamics, simulate
 from skevgp.features import AngleEncoder, InertiaForceGravity
 
 DT = 0.03
-# Of a trajectory to learn from, steps.
+# Number of steps of a training trajectory.
 LENGTH = 10
-# What counts as upright, rad, and how many steps it must last.
+# Largest angle that counts as upright, rad, and the number of steps that it must last.
 NEAR, LAST = 0.1, 34
-# Of the line search, all tried at once.
+# Step lengths of the line search, evaluated together.
 STEPS = 0.5 ** np.arange(8)[:, np.newaxis]
 
 
@@ -58,7 +58,7 @@ class Task:
 
 
 TASKS = {
-    # The torque would hold the pendulum at 24 degrees at most: it has to swing.
+    # The torque can hold the pendulum at 24 degrees at most, so it has to swing.
     "pendulum": Task(
         "pendulum",
         limit=2.0,

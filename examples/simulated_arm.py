@@ -2,9 +2,9 @@
 Logs of a simulated arm
 =======================
 
-For the examples that learn from a robot's logs, without a robot: an arm of the package example-robot-data moves along
-sums of sines, its gears have Coulomb's and viscous friction (the former grows with the load, as in harmonic drives),
-and what a robot's controller would write down goes into a file: irregular times, positions, velocities, currents.
+This module simulates logs for the examples that need a real robot. An arm of the package example-robot-data moves along
+sums of sines. Its gears have viscous friction, and Coulomb friction that grows with the load, as in harmonic drives. A
+file gets the signals that a robot's controller would record: irregular times, positions, velocities and currents.
 """
 
 import numpy as np
