@@ -68,16 +68,16 @@ except ImportError as error:
 
 
 class LearnedAction(crocoddyl.ActionModelAbstract):
-    """A step of a learned system, and what it costs to be away from a goal.
+    """A step of a learned system, with the cost of the distance from a goal.
 
     Parameters
     ----------
     model : CompiledPredictor
-        Of rows [state, input].
+        Predictor for rows [state, input].
     task : Task
-        With goal and limit.
+        Goal and limit of the input.
     weights : array-like
-        Of the encoded row, which has sines and cosines in place of angles.
+        Weights of the encoded row, which has sines and cosines instead of angles.
     """
 
     def __init__(self, model, task, weights):
@@ -88,7 +88,7 @@ class LearnedAction(crocoddyl.ActionModelAbstract):
         self.u_lb, self.u_ub = np.array([-task.limit]), np.array([task.limit])
 
     def calc(self, data, x, u=None):
-        """Without an input, as at the horizon's end, the state stays."""
+        """Compute next state and cost. Without an input, at the end of the horizon, the state does not change."""
         row = np.append(x, 0.0 if u is None else u)
         data.xnext = x if u is None else self.model.predict(row)
         data.r = self.weights * (self.encoder.transform(row[np.newaxis])[0] - self.goal)
@@ -126,7 +126,7 @@ rest = np.zeros(each_step.state.nx)
 
 
 def plan(Z, U):
-    """FDDP from a guess: the solver, and what each of its iterations came to."""
+    """Run FDDP from a guess. Return the solver and the log of its iterations."""
     solver = crocoddyl.SolverBoxFDDP(crocoddyl.ShootingProblem(rest, [each_step] * len(U), last))
     solver.th_stop, log = 1e-3, crocoddyl.CallbackLogger()
     solver.setCallbacks([log])
@@ -138,7 +138,7 @@ def plan(Z, U):
 
 
 def goal(z):
-    """At rest, upright on the side that is nearest to the pole of a state."""
+    """Return the state at rest, upright on the side nearest to the pole of a state."""
     upright = np.zeros_like(rest)
     upright[task.pole] = np.pi * (1.0 + 2.0 * np.round((z[task.pole] / np.pi - 1.0) / 2.0))
     return upright
@@ -157,7 +157,7 @@ gains = np.array(solver.K).reshape(task.n_steps, 1, -1)
 # Crocoddyl computes finite differences of ``calc`` at states and inputs along the plan.
 
 differences = crocoddyl.ActionModelNumDiff(each_step, True)
-differences.disturbance = 1e-5  # a larger step than its own, of which rounding would be a large share
+differences.disturbance = 1e-5  # larger than the default, because of rounding
 furthest = dict.fromkeys(("Fx", "Fu", "Lx", "Lu", "Lxx", "Lxu", "Luu"), 0.0)
 for z, u in zip(Z[:-1:10], U[::10], strict=True):
     pair = each_step.createData(), differences.createData()
@@ -178,7 +178,7 @@ print("off Crocoddyl's differences:", ", ".join(f"{name} {off:.0e}" for name, of
 
 
 def controller(z, t):
-    """The plan, and how it answers to states that are others than planned."""
+    """Return the input of the plan, with feedback on deviations from the planned states."""
     return np.clip(U[t] - (z - Z[t]) @ gains[t].T, -task.limit, task.limit)
 
 
@@ -190,7 +190,7 @@ ahead = rollout(learned.model, rest, controller, n_steps=task.n_steps, n_samples
 
 
 def off_upright(states):
-    """Of the pole, rad."""
+    """Return the distance of the pole from upright, rad."""
     return np.abs(states[..., task.pole] % (2.0 * np.pi) - np.pi)
 
 

@@ -158,7 +158,7 @@ for name, colour in colours.items():
     axes[1, 0].plot(seconds, 2 * std, color=colour, linestyle=":", label=f"{name}: 2 std")
 axes[0, 0].plot(seconds, truth, "k--", linewidth=1, label="truth")
 axes[0, 0].set(title="One-step predictions along a test trajectory, ±2 std", ylabel=velocity)
-axes[1, 0].set(title="Their errors, and what they promise", ylabel=velocity, yscale="log", xlabel="time (s)")
+axes[1, 0].set(title="Errors and standard deviations", ylabel=velocity, yscale="log", xlabel="time (s)")
 for ax in axes[:, 0]:
     ax.legend(loc="upper left")
 for ax, state in zip(axes[:, 1], range(n_states - 2, n_states), strict=True):

@@ -58,7 +58,7 @@ def torque(robot, positions):
 
 
 def rows(positions):
-    """[q, q̇, u] at rest."""
+    """Return rows [q, q̇, u] at rest."""
     return np.hstack([positions, np.zeros((len(positions), 2 * positions.shape[1]))])
 
 
@@ -79,7 +79,7 @@ times = 0.03 * np.arange(n_steps + 1)
 
 
 def along_the_swing(name, joint, **levers):
-    """Fitted weights (kg m) and the torque (N m) along the swing."""
+    """Return the fitted weights (kg m) and the torque (N m) along the swing."""
     robot = robots[name]
     features = LinkGravity(robot, **levers)
     fit = LinearRegression(fit_intercept=False).fit(

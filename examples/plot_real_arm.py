@@ -142,7 +142,7 @@ prior_cov = body.coef_prior(len(joints))[1]
 
 
 def interval(row, mean, covariance):
-    """Mean, and half of the width of the interval that holds 95 %, of row @ weights."""
+    """Return the mean of row @ weights, and half the width of its 95 % interval."""
     return np.array([row @ mean, 1.96 * np.sqrt(row @ covariance @ row)])
 
 

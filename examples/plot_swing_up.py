@@ -93,7 +93,7 @@ push = "force (N)" if has_cart else "torque (N m)"
 
 
 def draw(ax, state, u, center):
-    """The system at a state, around a place on the page."""
+    """Draw the system in a state, around a position on the page."""
     x = state[0] if has_cart else 0.0
     pole = state[task.pole]
     # The cartpole's axis points at us, the pendulum's away from us.

@@ -73,7 +73,7 @@ reference = arms.waves(1, 4.0 if quick else 8.0, options.seed + 2)
 feedforward = arms.missed_by(nominal, model, reference)
 runs = {
     "nominal model": arms.track(arm, ComputedTorque(nominal, reference), options.seed),
-    "with what was learned": arms.track(arm, ComputedTorque(nominal, reference, feedforward), options.seed),
+    "with the learned torques": arms.track(arm, ComputedTorque(nominal, reference, feedforward), options.seed),
 }
 errors = {name: 1e3 * np.sqrt(np.mean(run.error**2)) for name, run in runs.items()}
 for name, error in errors.items():
@@ -116,7 +116,7 @@ data = nominal.model.createData()
 
 
 def tip(q):
-    """Where the last joint is, m."""
+    """Return the position of the last joint, m."""
     places = []
     for row in q:
         pin.forwardKinematics(nominal.model, data, row)
@@ -137,7 +137,7 @@ axes[0, 0].set(title="The hand, seen from the front", xlabel="y (m)", ylabel="z 
 axes[0, 1].set(title="How far the hand is off", xlabel="time (s)", ylabel="mm", yscale="log", ylim=(0.02, 200.0))
 
 joint = 3
-run = runs["with what was learned"]
+run = runs["with the learned torques"]
 mean, std = (part[:, joint] for part in model.predict(run.motion[:, 0], return_std=True))
 believed = nominal.forces(*np.split(run.motion[:, 0], 3, axis=1))[:, joint]
 ax = axes[2, 0]
