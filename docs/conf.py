@@ -30,6 +30,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "mathjax",
     "pages",
+    "stories",
 ]
 exclude_patterns = ["_build", "tests", "generated/parts", "**sg_execution_times.rst"]
 templates_path = ["_templates"]
@@ -93,5 +94,5 @@ html_theme_options = {
 }
 # Pages on their own have nothing to list beside them; results are wide, and stories are listed by their pictures.
 ALONE = ["index", "start", "which_model", "comparison", "reproduction", "tests", "changelog", "generated/source/*"]
-ALONE += ["benchmarks", "generated/results/*", "auto_examples/*"]
+ALONE += ["questions", "benchmarks", "generated/results/*", "auto_examples/*"]
 html_sidebars = {page: [] for page in ALONE}

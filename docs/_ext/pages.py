@@ -22,6 +22,7 @@ from sphinx.config import Config
 
 import blocks
 import comparison
+import front
 import skevgp
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -72,6 +73,8 @@ def rewritten(text: str, folder: Path) -> str:
             return f"![{words}](/../{path})"
         if path.endswith(".py"):
             return f"{{src}}`{path}`"
+        if path.startswith("docs/") and path.endswith(".md"):
+            return f"{{doc}}`{words} </{path.removeprefix('docs/').removesuffix('.md')}>`"
         if path in PAGES:
             return f"{{doc}}`{words} <{PAGES[path]}>`"
         if path.startswith("benchmarks/results/") and path.endswith(".md"):
@@ -166,6 +169,7 @@ def generate(app: Sphinx, _: Config) -> None:
     for page in DOCS.rglob("*.md"):
         if not {"_build", "generated", "tests"} & set(page.relative_to(DOCS).parts):
             write_pictures(page)
+    front.write_front(GENERATED / "pictures")
     pages = [page for page in DOCS.rglob("*.md") if "_build" not in page.parts]
     pages.append(ROOT / "examples" / "GALLERY_HEADER.rst")
     named = {path for page in pages for path in SOURCE_ROLE.findall(page.read_text(encoding="utf-8"))}

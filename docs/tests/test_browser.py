@@ -11,13 +11,14 @@ from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
 # Page, its title, whether it has formulas, and whether it has pictures.
 TYPES = {
-    "index.html": ("skevgp", True, False),
+    "index.html": ("skevgp", True, True),
     "start.html": ("Start in five minutes", False, True),
     "guide/index.html": ("User guide", True, False),
     "guide/model.html": ("The model and its bound", True, False),
     "howto/logs.html": ("Read a log", False, True),
-    "which_model.html": ("Which model when", True, False),
-    "comparison.html": ("Comparison", False, False),
+    "which_model.html": ("Which model", False, False),
+    "comparison.html": ("How skevgp compares", False, False),
+    "questions.html": ("Questions", False, False),
     "auto_examples/index.html": ("Gallery", False, True),
     "auto_examples/plot_sparse_gp.html": ("A sparse Gaussian process in scikit-learn", False, True),
     "generated/api.html": ("API reference", True, False),
