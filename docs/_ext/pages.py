@@ -194,9 +194,15 @@ def skip_foreign(app: Sphinx, what: str, name: str, thing: Any, skip: bool, opti
     return True if callable(thing) and home and not home.startswith("skevgp") else None
 
 
+def keep_initials(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Keep the initial of an author at the beginning of an item from becoming a list of its own."""
+    lines[:] = [re.sub(r"^(\s*[*-] [A-Z])\. ", r"\1\\. ", line) for line in lines]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Generate pages before Sphinx looks for them."""
     app.connect("config-inited", generate)
     app.connect("autodoc-skip-member", skip_foreign)
+    app.connect("autodoc-process-docstring", keep_initials, priority=400)  # before numpydoc
     app.add_role("src", source_role)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
