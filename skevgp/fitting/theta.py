@@ -40,7 +40,7 @@ _NONLINEAR, _FITS = 0.1, 4
 # best of them that are improved.
 _START_ROWS, _TRIED_NARROW, _TRIED_BROAD, _IMPROVED = 500, 4, 64, 2
 # Columns of ∂h/∂z that are 0 on so many rows are left out.
-_SEEN_ROWS = 5000
+_SEEN_ROWS = 1000
 # Values of all z at which columns of ∂h/∂z are found.
 _TRIED_SLOPES = (0.0, 0.37, -0.61)
 # A Newton step that is longer than so many posterior standard deviations, but does not raise log p(y, z) at any length,
