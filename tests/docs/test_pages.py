@@ -94,7 +94,12 @@ FIGURES = [
     ("which_model.md", "2.98 ± 0.23 kg (95 %)", "payload", r"14harm50sec \| 0\.1 \| 2\.983 ± 0\.227"),
     ("comparison.md", "`model.compile()` | 23 |", "latency", r"compiled: row, mean and std \| 23 "),
     ("comparison.md", "`predict` | 49 |", "latency", r"predict: row, mean and std \| 49 "),
-    ("comparison.md", "| 1,000,000 | 72.0 | 59 | 5.86 | 3.20 | 8.14 |", "scaling", r"1000000 \| 72\.0 \| 59\.3 \| 5\.86 \| 3\.20"),
+    (
+        "comparison.md",
+        "| 1,000,000 | 72.0 | 59 | 5.86 | 3.20 | 8.14 |",
+        "scaling",
+        r"1000000 \| 72\.0 \| 59\.3 \| 5\.86 \| 3\.20",
+    ),
     ("benchmarks.md", "GPflow's last bound in 3.9 s", "against_peers", r"skevgp \| none \| 14940 .* 3\.93 \| 12\.6"),
     ("benchmarks.md", "took GPflow 49.7 s", "against_peers", r"GPflow SGPR \| none \| 14940 \| 256 \| 49\.7 "),
     ("benchmarks.md", "these are 23.8 and 116 s", "against_peers", r"skevgp \| none \| 36000 .* 23\.8 \| 4\.88"),
