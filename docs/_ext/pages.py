@@ -125,7 +125,7 @@ def tables(module: str, names: Iterable[str]) -> str:
 def write_api() -> None:
     """Write the overview of all public names; autosummary writes a page for each."""
     title, listed = "API reference", set()
-    parts = [f"{title}\n{'=' * len(title)}\n\nEvery public name, made of the docstrings, whose examples are tests.\n"]
+    parts = [f"{title}\n{'=' * len(title)}\n\nAll public names. The examples in these pages are tests.\n"]
     for name, module in public_modules():
         members = [each for each in module.__all__ if not each.startswith("_")]
         members = [each for each in members if not inspect.ismodule(getattr(module, each))]

@@ -1,11 +1,14 @@
 """How the gallery runs the examples, and in which groups and order it shows them."""
 
+from __future__ import annotations
+
 import builtins
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sphinx.application import Sphinx
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parents[1]
 # The name of a file, without "plot_".

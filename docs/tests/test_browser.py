@@ -105,6 +105,28 @@ def test_text_and_its_ground_differ_in_the_dark(browser, address):
     assert light[0] - light[1] > 300.0
 
 
+WITH_CODE = ["index.html", "start.html", "questions.html", "generated/api/skevgp.EVGPRegressor.html"]
+WITH_CODE += [f"auto_examples/plot_{story}.html" for story in ("sparse_gp", "rollout", "real_arm", "tracking")]
+WITH_CODE += [
+    f"{folder}/{page.stem}.html"
+    for folder in ("guide", "howto")
+    for page in sorted((Path(__file__).parents[1] / folder).glob("*.md"))
+]
+
+
+@pytest.mark.parametrize("page", WITH_CODE)
+def test_no_code_has_to_be_scrolled_at_a_desk(browser, address, page):
+    if browser.size == "phone":
+        return  # there it may
+    opened(browser, address, page)
+    wide = browser.execute_script(
+        """return [...document.querySelectorAll('article pre')]
+             .filter(e => e.getClientRects().length && e.scrollWidth > e.clientWidth + 1)
+             .map(e => e.textContent.split('\\n').sort((a, b) => b.length - a.length)[0])"""
+    )
+    assert wide == []
+
+
 def test_names_of_parameters_stand_on_one_line(browser, address):
     opened(browser, address, "generated/api/skevgp.EGPRegressor.html")
     names = browser.execute_script(

@@ -14,6 +14,7 @@ sys.path.insert(0, str(DOCS / "_ext"))
 
 import blocks  # noqa: E402
 import comparison  # noqa: E402
+import stories  # noqa: E402
 
 NOT_WRITTEN = {"_build", "generated", "tests"}
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not NOT_WRITTEN & set(page.relative_to(DOCS).parts)]
@@ -72,6 +73,11 @@ def test_code_fits_its_column():
             if not block.language.startswith("{") or block.language.startswith("{code-block}"):
                 found += [f"{page.name}: {line}" for line in block.body.splitlines() if len(line) > 72]
     assert not found
+
+
+def test_each_example_is_in_a_group_of_the_gallery():
+    examples = sorted((DOCS.parent / "examples").glob("plot_*.py"))
+    assert sorted(stories.ORDER) == [path.stem.removeprefix("plot_") for path in examples]
 
 
 def test_each_source_file_that_a_page_names_is_there():
