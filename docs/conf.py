@@ -30,6 +30,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "mathjax",
     "pages",
+    "stories",
 ]
 exclude_patterns = ["_build", "tests", "generated/parts", "**sg_execution_times.rst"]
 templates_path = ["_templates"]
@@ -95,4 +96,4 @@ html_theme_options = {
 ALONE = ["index", "start", "which_model", "comparison", "reproduction", "tests", "changelog", "generated/source/*"]
 ALONE += ["from_0_1_to_0_2"]
 ALONE += ["benchmarks", "generated/results/*", "auto_examples/*"]
-html_sidebars = {page: [] for page in ALONE}
+html_sidebars = {page: [] for page in [*ALONE, "questions"]}

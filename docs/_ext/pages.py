@@ -22,6 +22,7 @@ from sphinx.config import Config
 
 import blocks
 import comparison
+import front
 import skevgp
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -73,6 +74,8 @@ def rewritten(text: str, folder: Path) -> str:
             return f"![{words}](/../{path})"
         if path.endswith(".py"):
             return f"{{src}}`{path}`"
+        if path.startswith("docs/") and path.endswith(".md"):
+            return f"{{doc}}`{words} </{path.removeprefix('docs/').removesuffix('.md')}>`"
         if path in PAGES:
             return f"{{doc}}`{words} <{PAGES[path]}>`"
         if path.startswith("benchmarks/results/") and path.endswith(".md"):
@@ -123,7 +126,7 @@ def tables(module: str, names: Iterable[str]) -> str:
 def write_api() -> None:
     """Write the overview of all public names; autosummary writes a page for each."""
     title, listed = "API reference", set()
-    parts = [f"{title}\n{'=' * len(title)}\n\nEvery public name, made of the docstrings, whose examples are tests.\n"]
+    parts = [f"{title}\n{'=' * len(title)}\n\nAll public names. The examples in these pages are tests.\n"]
     for name, module in public_modules():
         members = [each for each in module.__all__ if not each.startswith("_")]
         members = [each for each in members if not inspect.ismodule(getattr(module, each))]
@@ -167,6 +170,7 @@ def generate(app: Sphinx, _: Config) -> None:
     for page in DOCS.rglob("*.md"):
         if not {"_build", "generated", "tests"} & set(page.relative_to(DOCS).parts):
             write_pictures(page)
+    front.write_front(GENERATED / "pictures")
     pages = [page for page in DOCS.rglob("*.md") if "_build" not in page.parts]
     pages.append(ROOT / "examples" / "GALLERY_HEADER.rst")
     named = {path for page in pages for path in SOURCE_ROLE.findall(page.read_text(encoding="utf-8"))}
@@ -191,9 +195,15 @@ def skip_foreign(app: Sphinx, what: str, name: str, thing: Any, skip: bool, opti
     return True if callable(thing) and home and not home.startswith("skevgp") else None
 
 
+def keep_initials(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Keep the initial of an author at the beginning of an item from becoming a list of its own."""
+    lines[:] = [re.sub(r"^(\s*[*-] [A-Z])\. ", r"\1\\. ", line) for line in lines]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Generate pages before Sphinx looks for them."""
     app.connect("config-inited", generate)
     app.connect("autodoc-skip-member", skip_foreign)
+    app.connect("autodoc-process-docstring", keep_initials, priority=400)  # before numpydoc
     app.add_role("src", source_role)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,13 +1,25 @@
-"""How the gallery runs the examples, and in which order it shows them."""
+"""How the gallery runs the examples, and in which groups and order it shows them."""
+
+from __future__ import annotations
 
 import builtins
+import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parents[1]
-# From the shortest story to the longest; the name of a file, without "plot_". New ones come last.
-ORDER = ["sparse_gp", "tabular", "learn_dynamics", "rollout", "link_gravity", "nominal_dynamics", "any_robot"]
-ORDER += ["online", "swing_up", "crocoddyl", "real_arm", "payload", "tracking"]
+# The name of a file, without "plot_".
+GROUPS = {
+    "Tables of numbers": ["sparse_gp", "tabular"],
+    "Dynamics of robots": ["learn_dynamics", "any_robot", "nominal_dynamics", "link_gravity", "calibrate_simulator"],
+    "Prediction and control": ["rollout", "online", "swing_up", "crocoddyl"],
+    "Arms and their torques": ["real_arm", "payload", "tracking"],
+}
+OTHERS = "More examples"  # of no group
+ORDER = [story for stories in GROUPS.values() for story in stories]
 
 
 class Order:
@@ -32,3 +44,34 @@ def arguments(_: dict[str, Any], script: dict[str, Any]) -> list[str]:
 def as_a_script(_: dict[str, Any], name: str) -> None:
     """Let examples know where they are, as scripts do: sphinx-gallery gives them no ``__file__``."""
     builtins.__file__ = str(DOCS.parent / "examples" / name)
+
+
+def grouped(text: str) -> str:
+    """Put a heading above each group of the gallery's thumbnails."""
+    opened = '.. raw:: html\n\n    <div class="sphx-glr-thumbnails">\n\n.. thumbnail-parent-div-open\n\n'
+    closed = ".. thumbnail-parent-div-close\n\n.. raw:: html\n\n    </div>\n\n"
+    before, _, rest = text.partition(opened)
+    inside, found, after = rest.partition(closed)
+    if not found:
+        raise ValueError("the index of the gallery is not what sphinx-gallery used to write")
+    group_of = {story: group for group, stories in GROUPS.items() for story in stories}
+    groups: dict[str, list[str]] = {group: [] for group in (*GROUPS, OTHERS)}
+    for part in re.split(r'(?=\.\. raw:: html\n\n    <div class="sphx-glr-thumbcontainer")', inside):
+        if name := re.search(r":doc:`/auto_examples/plot_(\w+)`", part):
+            groups[group_of.get(name[1], OTHERS)].append(part)
+    sections = [
+        f"{group}\n{'-' * len(group)}\n\n{opened}{''.join(parts)}{closed}" for group, parts in groups.items() if parts
+    ]
+    return before + "\n".join(sections) + after
+
+
+def group_gallery(app: Sphinx) -> None:
+    """Group the index of the gallery, after sphinx-gallery has written it."""
+    index = Path(app.srcdir, "auto_examples", "index.rst")
+    index.write_text(grouped(index.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Group the gallery before Sphinx looks for pages."""
+    app.connect("builder-inited", group_gallery, priority=900)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -11,13 +11,14 @@ from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
 # Page, its title, whether it has formulas, and whether it has pictures.
 TYPES = {
-    "index.html": ("skevgp", True, False),
+    "index.html": ("skevgp", True, True),
     "start.html": ("Start in five minutes", False, True),
     "guide/index.html": ("User guide", True, False),
     "guide/model.html": ("The model and its bound", True, False),
     "howto/logs.html": ("Read a log", False, True),
-    "which_model.html": ("Which model when", True, False),
-    "comparison.html": ("Comparison", False, False),
+    "which_model.html": ("Which model", False, False),
+    "comparison.html": ("How skevgp compares", False, False),
+    "questions.html": ("Questions", False, False),
     "auto_examples/index.html": ("Gallery", False, True),
     "auto_examples/plot_sparse_gp.html": ("A sparse Gaussian process in scikit-learn", False, True),
     "generated/api.html": ("API reference", True, False),
@@ -102,6 +103,28 @@ def test_text_and_its_ground_differ_in_the_dark(browser, address):
     _, ground = browser.execute_script(colour, "body")
     light = [sum(map(float, each.split("(")[1].rstrip(")").split(",")[:3])) for each in (text, ground)]
     assert light[0] - light[1] > 300.0
+
+
+WITH_CODE = ["index.html", "start.html", "questions.html", "generated/api/skevgp.EVGPRegressor.html"]
+WITH_CODE += [f"auto_examples/plot_{story}.html" for story in ("sparse_gp", "rollout", "real_arm", "tracking")]
+WITH_CODE += [
+    f"{folder}/{page.stem}.html"
+    for folder in ("guide", "howto")
+    for page in sorted((Path(__file__).parents[1] / folder).glob("*.md"))
+]
+
+
+@pytest.mark.parametrize("page", WITH_CODE)
+def test_no_code_has_to_be_scrolled_at_a_desk(browser, address, page):
+    if browser.size == "phone":
+        return  # there it may
+    opened(browser, address, page)
+    wide = browser.execute_script(
+        """return [...document.querySelectorAll('article pre')]
+             .filter(e => e.getClientRects().length && e.scrollWidth > e.clientWidth + 1)
+             .map(e => e.textContent.split('\\n').sort((a, b) => b.length - a.length)[0])"""
+    )
+    assert wide == []
 
 
 def test_names_of_parameters_stand_on_one_line(browser, address):
