@@ -101,19 +101,19 @@ functions and transformers are not in the list; ``skops.io.get_untrusted_types(f
 
 
 def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> None:
-    """Write a fitted model to a file from which loading runs no code.
+    """Write a fitted model to a file that loads without running code.
 
-    A loaded model predicts exactly the same, and can go on with ``partial_fit``. The data are loaded once as a test
-    before they are written. If anything fails, the old file is still there.
+    A loaded model predicts exactly the same values, and can continue with ``partial_fit``. Before the file is written,
+    it is loaded once as a test. If anything fails, an existing file stays as it is.
 
     Parameters
     ----------
     model : estimator
-        A fitted regressor or transformer of skevgp, or a scikit-learn estimator that contains one.
+        Fitted regressor or transformer of skevgp, or a scikit-learn estimator that contains one.
     path : str or path-like
         File to write, for example ``"arm.skevgp"``. An existing file is replaced.
     trusted : sequence of str, default=()
-        Names of further types in the model, such as your own transformers: ``["my_package.MyMap"]``. `load` needs the
+        Names of further types in the model, such as ``["my_package.MyMap"]`` for your own transformer. `load` needs the
         same list.
 
     Raises
@@ -121,7 +121,7 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
     ImportError
         If skops is not installed.
     ValueError
-        If the model holds other types, which the message names, or could not be loaded again.
+        If the model contains other types, which the message names, or cannot be loaded again.
     sklearn.exceptions.NotFittedError
         If the model is not fitted.
     OSError
@@ -133,9 +133,9 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
 
     Notes
     -----
-    A named system is stored as its name, and any other robot as numbers. Its URDF file and example-robot-data are not
-    needed to load the model. A path that was given as ``robot`` stays in the parameters as text, and is used by another
-    ``fit`` or by `InverseDynamics.write_urdf` only.
+    A named system is stored as its name, and any other robot as numbers. Loading the model needs neither its URDF file
+    nor example-robot-data. A path that was given as ``robot`` is stored as text. Only another ``fit`` and
+    `InverseDynamics.write_urdf` use it.
 
     Examples
     --------
@@ -170,16 +170,16 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
 def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
     """Read a model from a file that `save` has written.
 
-    Only types in `TRUSTED_TYPES`, in ``trusted``, and those that skops trusts are created. No code of the file is run,
-    so that files from unknown sources are safe to load. The model must predict the same for a few rows as when it was
-    saved.
+    Files from unknown sources are safe to load, because no code of the file is run. Only types in `TRUSTED_TYPES` and
+    in ``trusted``, and types that skops trusts, are created. The model must predict the same for a few rows as when it
+    was saved.
 
     Parameters
     ----------
     path : str or path-like
         File to read.
     trusted : sequence of str, default=()
-        Names of further types to trust, such as your own transformers: ``["my_package.MyMap"]``.
+        Names of further types to trust, such as ``["my_package.MyMap"]`` for your own transformer.
 
     Returns
     -------
@@ -189,8 +189,8 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
     Raises
     ------
     ValueError
-        If the file is damaged, was not written by `save`, has another format or needs other types, or if the model
-        predicts something else than before, which may happen with another version of scikit-learn.
+        If the file is damaged, was not written by `save`, has another format, or needs other types. If the model
+        predicts other values than before, which may happen with another version of scikit-learn.
     ImportError
         If skops, Pinocchio or a package of data frames is needed and not installed.
     OSError

@@ -110,31 +110,31 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool or "joint", default=False
-            Whether to return the covariance between rows too, for each output. ``"joint"`` includes the covariance
-            between outputs, which depend on each other if they share their weights.
+            Whether to return the covariance between rows too, for each output. If ``"joint"``, the covariance between
+            outputs is included. Outputs depend on each other if they share their weights.
         include_noise : bool, default=True
-            Whether standard deviation and covariance include the learned noise of y, or are those of the noise-free
-            g(x).
+            Whether standard deviation and covariance include the learned noise of y. If False, they are those of the
+            noise-free g(x).
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
             Posterior mean.
         std : ndarray of the same shape
-            Standard deviation. Only if ``return_std``.
+            Standard deviation. It is returned only if ``return_std`` is True.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
-            Covariance. Only if ``return_cov``. For ``"joint"``, of shape (n_samples * n_outputs, n_samples *
-            n_outputs), in the order of ``mean.ravel()``.
+            Covariance. It is returned only if ``return_cov`` is set. With ``"joint"``, its shape is (n_samples *
+            n_outputs, n_samples * n_outputs), in the order of ``mean.ravel()``.
 
         Raises
         ------
         ValueError
-            If X does not fit the training data or is not finite, if both ``return_std`` and ``return_cov`` are set, or
-            if ``return_cov`` is set for a Dask array.
+            If X does not fit the training data or is not finite. If both ``return_std`` and ``return_cov`` are set, or
+            ``return_cov`` is set for a Dask array.
 
         Notes
         -----
-        The diagonal of the covariance is the square of ``std``. Variances are not below their rounding error, about
+        The diagonal of the covariance is the square of ``std``. Variances are at least their rounding error, about
         1e-15 of the signal variance.
         """
         if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
@@ -170,7 +170,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         random_state : int, RandomState instance or None, default=0
             Seed of the functions. An integer gives the same functions at each call.
         include_noise : bool, default=True
-            Whether samples are those of y, with the learned noise, or those of the noise-free g(x).
+            Whether samples are those of y, with the learned noise. If False, they are those of the noise-free g(x).
 
         Returns
         -------
@@ -205,7 +205,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Returns
         -------
         summary : ModelSummary
-            Object that prints as text, shows as tables in notebooks, and has ``to_frame()``.
+            Object that prints as text. A notebook shows it as tables, and ``to_frame()`` returns a data frame.
         """
         check_fitted(self)
         return of_gaussian_process(self)
@@ -223,9 +223,10 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return bundle
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters. With ``solver__...``, a solver that is a string becomes an object.
+        """Set parameters of the estimator and of its nested objects.
 
-        So do a noise and a prior of the weights.
+        With ``solver__...``, a solver that is a string becomes an object. The same holds for the noise and the prior of
+        the weights.
 
         Parameters
         ----------
