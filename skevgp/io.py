@@ -230,8 +230,8 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
         raise ValueError(f"{os.fspath(path)!r} cannot be loaded: {_said(error)}.") from error
     if not tried and made_with.get("scikit-learn") != sklearn.__version__:
         warn_user(
-            f"{os.fspath(path)!r} was saved with {_told(made_with)} (here: {_told(_about())}). What the model predicts "
-            "could not be compared.",
+            f"{os.fspath(path)!r} was saved with {_told(made_with)} (here: {_told(_about())}). Its predictions could "
+            "not be compared.",
             InconsistentVersionWarning,
         )
     return model
@@ -266,7 +266,7 @@ def _made(data: bytes, trusted: list[str]) -> tuple[Any, bool]:
     skops = require("skops.io", "Loading a model")
     if unknown := sorted(set(skops.get_untrusted_types(data=data)) - set(trusted)):
         raise ValueError(
-            f"it holds {', '.join(unknown[:20])}, not a type to trust by default. If you trust its code, name it in "
+            f"it holds {', '.join(unknown[:20])}, which is not trusted by default. If you trust its code, name it in "
             "trusted=[...]"
         )
     content = skops.loads(data, trusted=trusted)
@@ -356,7 +356,7 @@ def _compare(model: Any, trial: Any) -> None:
     of_std = allowed + _OF_LARGEST * np.abs(expected).max(axis=0, initial=0.0)
     near = (np.abs(mean - expected) <= allowed) & (np.abs(std - expected_std) <= of_std)
     if not (near & np.isfinite(allowed)).all():
-        raise ValueError("its model predicts something else than when it was saved")
+        raise ValueError("its model predicts other values than when it was saved")
 
 
 def _about() -> dict[str, Any]:

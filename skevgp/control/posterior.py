@@ -230,7 +230,7 @@ class Posterior:
             ``return_cov`` are True. If functions of the kernel have no gradient, such as Matern with nu=0.5.
         """
         if return_std and return_cov:
-            raise ValueError("At most one of return_std and return_cov can be asked for.")
+            raise ValueError("At most one of return_std and return_cov can be requested.")
         fast, maps = self.compile(), as_maps(self.maps)
         parts, covariances = [], []
         for rows in self._few(X):

@@ -274,7 +274,7 @@ def _drive(regressor: Any, batch: np.ndarray, given: ArrayLike | Controller, n_s
             raise ValueError("With a controller the regressor must have n_features_in_.")
         return _Drive(n_steps, columns - n_states, None, given)
     if n_steps is not None:
-        raise ValueError("n_steps is for a controller; given inputs say how many steps there are.")
+        raise ValueError("Pass n_steps only with a controller. The inputs determine the number of steps.")
     U = _finite(given, "U")
     n_inputs = columns - n_states if columns is not None else U.shape[-1]
     if U.ndim == 1 and n_inputs == 1:
@@ -290,13 +290,13 @@ def _drive(regressor: Any, batch: np.ndarray, given: ArrayLike | Controller, n_s
 def _finite(given: ArrayLike, name: str) -> np.ndarray:
     values = as_floats(given, name)
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
+        raise ValueError(f"{name} must be finite; it contains {values[~np.isfinite(values)][0]}.")
     return values
 
 
 def _within_limits(values: np.ndarray, t: int) -> np.ndarray:
     if not (np.abs(values) <= LARGEST).all():
-        raise ValueError(f"States grow beyond {LARGEST:g} at step {t}: the learned system is unstable.")
+        raise ValueError(f"States grow beyond {LARGEST:g} at step {t}. The learned system is unstable.")
     return values
 
 

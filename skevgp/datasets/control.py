@@ -143,7 +143,7 @@ class ComputedTorqueController:
             raise ValueError(f"q0 and q1 must have {n} columns for {layout.name!r}; got {self._q0.shape[1]}.")
         self._kp, self._kd, self._ki = (_gain(k, name, n) for k, name in ((kp, "kp"), (kd, "kd"), (ki, "ki")))
         if (self._kd * dt >= 2.0).any():
-            raise ValueError(f"kd must be below 2 / dt = {2.0 / dt:g}, or the held loop is unstable; got {kd!r}.")
+            raise ValueError(f"kd must be below 2 / dt = {2.0 / dt:g}, because larger gains are unstable; got {kd!r}.")
         self.integral = np.zeros_like(self._q0)
         self._next = 0
 

@@ -149,12 +149,12 @@ def simulate(
         )
     if callable(U):
         if n_steps is None:
-            raise ValueError("With a controller, n_steps is needed.")
+            raise ValueError("A controller needs n_steps.")
         if isinstance(U, ComputedTorqueController) and not math.isclose(U.dt, dt):
             raise ValueError(f"dt must be that of the controller, {U.dt!r}; got {dt!r}.")
         n_steps, controller = check_integer(n_steps, "n_steps", minimum=0), U
     elif n_steps is not None:
-        raise ValueError(f"n_steps is for a controller; the inputs U have their own number of steps. Got {n_steps!r}.")
+        raise ValueError(f"Pass n_steps={n_steps!r} only with a controller. U determines the number of steps.")
     else:
         n_steps, controller = _held(as_floats(U, "U"), len(z), n_inputs, single, layout.name)
     if not np.isfinite(z).all():

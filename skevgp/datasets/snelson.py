@@ -93,7 +93,7 @@ def _fetch(folder: Path, n_retries: int, delay: float) -> dict[str, np.ndarray]:
         reason = str(problem).rstrip(".")
         raise OSError(
             f"Snelson's data could not be fetched from {_ADDRESS} ({reason}). Put the files {', '.join(_CHECKSUMS)} "
-            f"(with or without .dat) into {folder}, or give a folder that holds them as data_home."
+            f"(with or without .dat) into {folder}, or pass their folder as data_home."
         ) from problem
     folder.mkdir(exist_ok=True)
     for name, content in contents.items():

@@ -140,12 +140,12 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
         if return_std and return_cov:
-            raise ValueError("At most one of return_std and return_cov can be asked for.")
+            raise ValueError("At most one of return_std and return_cov can be requested.")
         if not self.__sklearn_is_fitted__():
             return self._before_fit(X).predict(X, return_std, return_cov, include_noise)
         if is_dask(X):
             if return_cov:
-                raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
+                raise ValueError("return_cov needs all rows in memory. Pass X.compute() instead of a Dask array.")
             X = as_rows(X, "X", known=False)
             checked_rows(self, X)
             shape = () if self._n_outputs == 1 else (self._n_outputs,)
@@ -251,7 +251,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         kind = type(self).__name__
         if name in _OF_WEIGHTS:
             raise AttributeError(
-                f"{kind} has {name} only after a fit with a feature_map: without one there are no weights."
+                f"{kind} has {name} only after a fit with a feature_map, because its features have the weights."
             )
         if name in _OF_THETA:
             raise AttributeError(f"{kind} has {name} only after a fit with a feature_map that has parameters.")
@@ -276,7 +276,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         if is_plain(self, X):
             return Rows(X, X)
         if is_dask(X):
-            raise ValueError(f"{asked} needs rows in memory: not for Dask arrays. Give it X.compute().")
+            raise ValueError(f"{asked} needs rows in memory. Pass X.compute() instead of a Dask array.")
         return Rows(*checked_rows(self, X)[:2])
 
     def _checked_numbers(self, X: Any, asked: str) -> np.ndarray:
@@ -284,7 +284,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         if is_plain(self, X):
             return X
         if is_dask(X):
-            raise ValueError(f"{asked} needs rows in memory: not for Dask arrays. Give it X.compute().")
+            raise ValueError(f"{asked} needs rows in memory. Pass X.compute() instead of a Dask array.")
         return checked_numbers(self, X)[0]
 
     @property

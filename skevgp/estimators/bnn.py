@@ -299,7 +299,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             If X does not fit the training data or is not finite, or if both ``return_std`` and ``return_cov`` are set.
         """
         if return_std and return_cov:
-            raise ValueError("At most one of return_std and return_cov can be asked for.")
+            raise ValueError("At most one of return_std and return_cov can be requested.")
         blocks = self._blocks_of_outputs(self._validated(X), self._weights)
         scale, offset = self._scaling.y_scale, self._scaling.y_mean
         noise = self._noise if include_noise else np.zeros_like(self._noise)
@@ -362,7 +362,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         scales = as_floats(self.prior_scale, "prior_scale")
         if scales.ndim > 1 or (scales.ndim == 1 and len(scales) != len(sizes) - 1):
             raise ValueError(
-                f"prior_scale must be a number or {len(sizes) - 1}, one a layer; got {self.prior_scale!r}."
+                f"prior_scale must be a number or one for each of {len(sizes) - 1} layers; got {self.prior_scale!r}."
             )
         if not ((scales >= 1e-30) & (scales <= 1e30)).all():
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
@@ -382,7 +382,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         n_held_back = max(1, round(self.validation_fraction * len(X))) if self.early_stopping else 0
         if n_held_back == len(X):
             raise ValueError(
-                f"validation_fraction={self.validation_fraction!r} of {len(X)} rows leaves none to learn from."
+                f"validation_fraction={self.validation_fraction!r} of {len(X)} rows leaves no rows for training."
             )
         held_back = np.zeros(len(X), dtype=np.bool_)
         held_back[rng.permutation(len(X))[:n_held_back]] = True

@@ -249,7 +249,7 @@ class EGPRegressor(GaussianProcess):
             or a parameter of the given kernel is at a bound. The message gives advice.
         """
         if is_dask(X):
-            raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
+            raise TypeError("X is a Dask array, but the exact model needs all rows in memory. Use EVGPRegressor.")
         progress = monitor_of(self.verbose, max_time=self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             data = Dataset.from_user(self, X, y, sample_weight, relative_variance)
@@ -302,8 +302,8 @@ class EGPRegressor(GaussianProcess):
         if self.alpha is not None:
             if spec.starts.noise.value is not None:
                 raise ValueError(
-                    f"alpha={self.alpha!r} is the noise, but a WhiteKernel or Gaussian(variance=...) says that it is "
-                    "to be learned; give one of them."
+                    f"alpha={self.alpha!r} fixes the noise, but a WhiteKernel or Gaussian(variance=...) asks to learn "
+                    "it. Pass one of them only."
                 )
             spec = spec.with_noise(self.alpha, fixed=True)
         return replace(problem, spec=spec, orthogonal=self.discrepancy == "orthogonal")
@@ -323,8 +323,8 @@ class EGPRegressor(GaussianProcess):
         problem = model._problem(data)
         if problem.vague.any():
             raise NotFittedError(
-                f"This {type(self).__name__} is not fitted yet, and with an infinite scale of CoefPrior nothing is "
-                "known before."
+                f"This {type(self).__name__} is not fitted yet. It predicts before a fit only if all scales of "
+                "CoefPrior are finite."
             )
         rows, spec, prior = problem.units.rows(data.source), problem.spec.as_given(), problem.units.prior
         model.kernel_map_ = data.maps.kernel_map
@@ -375,7 +375,7 @@ class EGPRegressor(GaussianProcess):
             return self.log_marginal_likelihood_value_
         predictor = self._posterior.predictor
         if predictor.shared:
-            raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: not shared ones.")
+            raise ValueError("log_marginal_likelihood(theta) does not support weights that outputs share.")
         order, given, width = self._spec.order, self._spec.given_order, np.shape(theta)[-1:]
         # Fitted hyperparameters of k̃, s² and σ² of each output, in the user's units.
         fitted = [

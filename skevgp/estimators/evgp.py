@@ -382,8 +382,8 @@ class EVGPRegressor(GaussianProcess):
         noise = as_noise(self.noise)
         if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
             raise ValueError(
-                f"With noise={self.noise!r}, partial_fit needs rows in memory or in a file, and forgetting_factor=1 (a "
-                f"change of the system would look like outliers); got forgetting_factor={forgetting_factor!r}."
+                f"With noise={self.noise!r}, partial_fit needs rows in memory or in a file, and forgetting_factor=1; "
+                f"got forgetting_factor={forgetting_factor!r}."
             )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             maps, fitted = self._posterior.maps, self._fitted
@@ -472,7 +472,7 @@ class EVGPRegressor(GaussianProcess):
         except ValueError as error:
             words = words_of(data.given) if is_frame(data.given) else []
             which = f" The columns {words} are not numbers." if words else ""
-            raise ValueError(f"inputs of Gaussian noise needs numbers in X, none of them missing.{which}") from error
+            raise ValueError(f"inputs of Gaussian noise needs numbers in X without missing values.{which}") from error
 
     def _set_attributes(self, fitted: Fitted, data: Dataset) -> None:
         points = [group.points for group in self._posterior.predictor.by_output]

@@ -308,8 +308,8 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         if self.base is None:
             if n_outputs > self.n_features_in_:
                 raise ValueError(
-                    f"base=None takes the first n_outputs={n_outputs} columns of X, which has {self.n_features_in_}; "
-                    "give base the column from which each output starts."
+                    f"base=None takes the first n_outputs={n_outputs} columns of X, which has {self.n_features_in_}. "
+                    "Pass base=..., the column that is subtracted from each output."
                 )
             return np.arange(n_outputs)
         columns = np.atleast_1d(np.asarray(self.base, dtype=object))

@@ -122,7 +122,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         X : array-like of shape (n_samples, n_features)
             Rows.
         y : Ignored
-            Not used.
+            It is not used.
 
         Returns
         -------

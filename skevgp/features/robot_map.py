@@ -178,8 +178,9 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Notes
         -----
         `LinkGravity` uses ∂(Rᵢᵀ g)/∂q_j = Rᵢᵀ (g × a_j) for each revolute joint j with axis a_j between the base and
-        link i. `NominalDynamics` uses the derivatives of Pinocchio (Carpentier & Mansard 2018, "Analytical derivatives
-        of rigid body dynamics algorithms").
+        link i.
+
+        `NominalDynamics` uses the analytical derivatives of Pinocchio (Carpentier & Mansard, RSS 2018).
         """
         return self._slopes(self._checked(X))
 
@@ -353,7 +354,7 @@ class ParametricMap(RobotTransformer):
                 )
             for other, (its_kind, its_joints) in targets.items():
                 if kind == its_kind and set(joints) & set(its_joints):
-                    raise ValueError(f"The parameters {other!r} and {name!r} are for the same joint: leave one out.")
+                    raise ValueError(f"Parameters {other!r} and {name!r} are for the same joint. Remove one of them.")
             targets[name] = kind, joints
         return targets
 
@@ -555,7 +556,7 @@ class RobotMap(RobotTransformer):
             names = [layout.state_names[row] for row in rows]
             raise ValueError(
                 f"y has {n_outputs} columns, but {type(self).__name__} of the robot {layout.name!r} predicts "
-                f"{len(rows)} states: {names}. Say which ones y holds with outputs=[...]; the names are "
+                f"{len(rows)} states: {names}. Name the columns of y by outputs=[...]. The names are "
                 f"{layout.state_names}."
             )
         return rows

@@ -155,10 +155,10 @@ def resolved(
     for name in ("mean", "scale", "cov", "groups"):
         value = getattr(prior, name)
         if feature_map is None and (isinstance(value, list | tuple) or np.ndim(value) > 0):
-            raise ValueError(f"{name} of CoefPrior needs a feature_map: without one there are no weights.")
+            raise ValueError(f"{name} of CoefPrior needs a feature_map, because its features have the weights.")
     if prior.cov is not None and _word(prior.scale) != "auto":
         raise ValueError(
-            f"cov and scale={prior.scale!r} of CoefPrior both say how far weights may be; give one of them."
+            f"cov and scale={prior.scale!r} of CoefPrior both set the prior covariance. Pass one of them only."
         )
     by_hand = _word(prior.scale) != "auto" or prior.cov is not None
     parts: list[_Part] = []
@@ -238,7 +238,7 @@ def _groups(
         groups[...] = labels
         groups[np.array([[label is None for label in row] for row in groups], dtype=bool)] = ""
         if not all(isinstance(label, str) for label in groups.ravel()):
-            raise ValueError(f"groups of CoefPrior must be words, or None for none; got {prior.groups!r}.")
+            raise ValueError(f"groups of CoefPrior must be strings or None; got {prior.groups!r}.")
         return groups
     labelled = [part for part in parts if hasattr(part.feature_map, "coef_groups")]
     for part in [] if by_hand else labelled:
@@ -262,7 +262,7 @@ def root_of_correlation(correlation: np.ndarray, groups: np.ndarray) -> np.ndarr
         if correlation[own][:, groups != group].any():
             raise ValueError(
                 f"Weights of different groups must be independent; those of the group {group!r} are correlated with "
-                "others. CoefPrior(groups=None) leaves all scales as they are."
+                "others. CoefPrior(groups=None) keeps all scales."
             )
         eigenvalues, vectors = eigh(correlation[np.ix_(own, own)])
         root[np.ix_(own, own)] = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))

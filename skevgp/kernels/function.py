@@ -281,7 +281,7 @@ class Function(Covariance):
                 return differentiate()
         except (TypeError, ValueError, AttributeError, NotImplementedError, IndexError) as error:
             raise ValueError(
-                f"{name_of(self.function)} cannot be traced by autograd: write it with autograd.numpy in place of "
+                f"{name_of(self.function)} cannot be traced by autograd. Write it with autograd.numpy instead of "
                 f"numpy. ({type(error).__name__}: {error})"
             ) from error
 

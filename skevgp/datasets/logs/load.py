@@ -230,7 +230,7 @@ def load_log(
         if delay != "auto":
             raise ValueError(f'delay must be "auto", a number, or one for each joint, s; got {delay!r}.')
         if robot is None:
-            raise ValueError('delay="auto" needs robot=...: its dynamics tell which delay fits the motion.')
+            raise ValueError('delay="auto" needs robot=..., whose dynamics determine the delay.')
     if not isinstance(decimal, str) or decimal not in (".", ","):
         raise ValueError(f"decimal must be '.' or ','; got {decimal!r}.")
     if joints is not None and (
@@ -249,7 +249,7 @@ def load_log(
         with naming(file):
             if file.is_dir() or file.suffix.lower() in BAGS:
                 if asked is not None:
-                    raise ValueError("columns are those of a table; in a rosbag2 recording choose topic and joints.")
+                    raise ValueError("columns is for tables. For a rosbag2 recording, choose topic and joints.")
                 read = read_bag(file, topic, names, ignored)
             else:
                 read = _table(file, asked, time_unit, topic, names, decimal)
@@ -277,9 +277,9 @@ def _files(path: Any, keep: Any) -> tuple[list[Path], list[Any]]:
         raise TypeError(f"path must be a path or a list of paths; got {path!r}.")
     files = [Path(one) for one in path]
     if not files:
-        raise ValueError("path must be a file or several; got none.")
+        raise ValueError("path must be one file or several; got an empty list.")
     if keep is not None and (not isinstance(keep, list) or len(keep) != len(files)):
-        raise ValueError(f"keep must be a list with one for each of the {len(files)} files; got {keep!r}.")
+        raise ValueError(f"keep must be a list with one value for each of the {len(files)} files; got {keep!r}.")
     return files, [None] * len(files) if keep is None else [_check_keep(one) for one in keep]
 
 
@@ -309,7 +309,7 @@ def _kept(time: np.ndarray, keep: Keep | None) -> np.ndarray:
     else:
         kept = rows[keep or slice(None)]
     if not len(kept):
-        raise ValueError(f"keep={keep!r} leaves none of its {len(time)} rows of {np.nanmax(time):g} s.")
+        raise ValueError(f"keep={keep!r} selects none of the {len(time)} rows, which last {np.nanmax(time):g} s.")
     return kept
 
 
@@ -327,9 +327,9 @@ def _table(
         hint = " Convert it with: rosbags-convert --src in.bag --dst out" if ending == ".bag" else ""
         raise ValueError(f"its name must end in one of {', '.join([*TABLES, *BAGS])}.{hint}")
     if columns is None:
-        raise ValueError("columns must say where a table has its signals, by numbers from 0 or by names.")
+        raise ValueError("pass columns=..., which says by numbers from 0 or by names where a table has its signals.")
     if topic is not None:
-        raise ValueError(f"topic={topic!r} is for rosbag2 recordings; this is a table.")
+        raise ValueError(f"topic={topic!r} is for rosbag2 recordings, but the file is a table.")
     read = read_table(file, columns, time_unit, decimal)
     if names is not None and len(names) != len(read.joint_names):
         raise ValueError(f"it has {len(read.joint_names)} joints; expected {len(names)}: {names}.")
@@ -425,8 +425,8 @@ def _warn_of_delays(recordings: list[Bunch]) -> None:
     if late:
         told = ", ".join(f"{1e3 * delay:.1f} ms in {filename}" for filename, delay in late.items())
         warn_user(
-            f"Efforts lag behind positions by {told} (below 0: they are ahead). This was corrected. Pass delay=0.0 to "
-            "keep the times.",
+            f"Efforts lag behind positions by {told}. A negative lag means that they are ahead. The lag was corrected. "
+            "Pass delay=0.0 to keep the recorded times.",
             RobotModelWarning,
         )
 

@@ -38,8 +38,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     transitions : :class:`~sklearn.utils.Bunch`
         Dictionary-like object with
 
-        - ``data`` : ndarray of shape (n_rows, 3 * n_joints + 1), with positions (rad or m), velocities, torques (N m or
-          N) and, in the last column, the time to the target ``"dt"`` (s);
+        - ``data`` : ndarray of shape (n_rows, 3 * n_joints + 1), with positions, velocities, torques and, in the last
+          column, the time to the target ``"dt"``, in SI units;
         - ``target`` : ndarray of shape (n_rows, 2 * n_joints), with positions and velocities after ``dt``;
         - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
         - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
@@ -86,11 +86,11 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     """
     check_integer(stride, "stride", minimum=1)
     if not isinstance(log, Bunch) or "recordings" not in log:
-        raise TypeError(f"log must be what load_log returns; got {type(log).__name__}.")
+        raise TypeError(f"log must be a result of load_log; got {type(log).__name__}.")
     parts = [_transitions(recording, stride) for recording in log.recordings]
     lengths = [len(part) for part in parts]
     if not any(lengths):
-        raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest: lower stride={stride}.")
+        raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest. Lower stride={stride}.")
     rows, n = np.vstack(parts), len(log.joint_names)
     data, target, time = rows[:, : 3 * n + 1], rows[:, 3 * n + 1 : -1], rows[:, -1]
     if return_X_y:
@@ -116,8 +116,8 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
     raw = recording.raw
     if raw.velocity is None:
         raise ValueError(
-            f"{recording.filename}: there are no recorded velocities, which are half of the state. Differences of "
-            'unfiltered positions are too noisy to replace them, so velocity="derive" of load_log leaves none.'
+            f"{recording.filename}: there are no recorded velocities, which the states need. Differences of "
+            'unfiltered positions are too noisy to replace them. velocity="derive" of load_log ignores velocities.'
         )
     steps = np.diff(raw.time)
     whole = np.ones(len(steps), dtype=bool)
