@@ -4,6 +4,7 @@
     python benchmarks/robots.py real --data ../data --quick    # a split per arm, few rows and iterations: a minute
     python benchmarks/robots.py identification                 # 50 runs, each without and with a filter: minutes
     python benchmarks/robots.py identification --quick         # one run of few rows: seconds
+    python benchmarks/robots.py payload --data ../data --seeds 20  # minutes; without --data of simulated arms only
 
 *real*: the folder has a folder of logs per arm. Arms without logs are left out. No row of the logs is written anywhere.
 
@@ -20,6 +21,10 @@ A second CSV has the load and the friction that were found.
 noise of 2 % of their scatter. Data are given as they are, or written to a file that `load_log` reads with a filter of
 5 Hz. `InverseDynamics` is asked for weights whose posterior variance is below a quarter of the prior's (in
 eigen-directions of the posterior, in units of the prior), and for torques on other trajectories.
+
+*payload*: intervals of payloads. Simulated arms like those of *identification* have unknown velocities of friction, and
+gains with errors. Three moves are without a payload, and a fourth one with it. Moves are alike, or differ in friction
+and gains. The load of the UR10e is identified from a whole log and from its fifths, of arms known from different logs.
 """
 
 from __future__ import annotations
@@ -29,11 +34,13 @@ import tempfile
 from collections import namedtuple
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pinocchio
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.ensemble import HistGradientBoostingRegressor, RandomForestRegressor
 from sklearn.multioutput import MultiOutputRegressor
@@ -566,7 +573,124 @@ def identification(options: Any, output: Path) -> tuple[harness.Tables, int]:
     return identification_tables(harness.frame(output, size=options.size)), n_failures
 
 
+# --- payloads ------------------------------------------------------------------------------------------------------
+
+# A loaded log of the UR10e, whole and in fifths, of an arm known from other logs, joined by "+".
+Weighed = namedtuple("Weighed", "trained gain_scale size")
+# A simulated arm whose gains have errors with standard deviation ``gain_scale``. ``moves`` are alike or differ.
+Carried = namedtuple("Carried", "gain_scale moves seed size")
+
+FIFTHS, GAIN_SCALES, MOVES = 5, (0.0, 0.1), ("alike", "differ")
+# Masses of simulated payloads, kg; relative differences of friction and gains between moves.
+MASSES, OF_FRICTION, OF_GAINS = (1.0, 5.0), 0.05, 0.005
+# Prior of the velocities of friction: median, rad/s, and standard deviation of the logarithm.
+VELOCITIES = (0.015, 0.7)
+
+
+def weigh(cell: Weighed, folder: Path) -> list[dict[str, Any]]:
+    """Identify the payload of the UR10e from the whole log, and from each fifth of it."""
+    loaded, _, mass = LOADS[0]
+    train = rows_of("ur10e", cell.trained.split("+"), folder, cell.size)
+    log = rows_of("ur10e", [loaded], folder, cell.size)
+    arm = arm_of(urdf_of("ur10e", folder), cell.size == "quick", cell.gain_scale)
+    with harness.one_thread():
+        arm.fit(train.data, train.target, groups=train.groups)
+        parts = {"whole": np.arange(len(log.data))}
+        parts |= {f"{k + 1}/{FIFTHS}": own for k, own in enumerate(np.array_split(parts["whole"], FIFTHS))}
+        found = {name: arm.estimate_payload(log.data[own], log.target[own]) for name, own in parts.items()}
+    return [{"part": name, "true": mass, "value": one.mass, "std": one.mass_std} for name, one in found.items()]
+
+
+def carry(cell: Carried) -> list[dict[str, Any]]:
+    """Identify a simulated arm from three moves, and its payload from a fourth; returns errors of each quantity."""
+    rng = np.random.default_rng(1000 + cell.seed)
+    nominal, true = load_robot(ROBOT), perturb_robot(ROBOT, ERROR, random_state=cell.seed)
+    n, largest = nominal.nv, np.minimum(nominal.upperEffortLimit, LARGEST)
+    viscous, coulomb = (rng.uniform(*FRICTION, n) * largest for _ in range(2))
+    velocity = VELOCITIES[0] * np.exp(VELOCITIES[1] * rng.normal(size=n))
+    gains = 1.0 + cell.gain_scale * rng.normal(size=n)
+    mass, com = rng.uniform(*MASSES), np.array([0.0, 0.0, 0.1]) + 0.05 * rng.normal(size=3)
+    differ = float(cell.moves == "differ")
+
+    def rows() -> tuple[np.ndarray, np.ndarray]:
+        X = trajectory(rng, n, cell.size)
+        body = RigidBodyRegressor(true, stiction_velocity=velocity).fit(X)
+        links = np.concatenate([link.toDynamicParameters() for link in list(true.inertias)[1:]])
+        rubbing = 1.0 + differ * OF_FRICTION * rng.normal(size=(2, n))
+        friction = np.concatenate([rubbing[0] * viscous, rubbing[1] * coulomb, np.zeros(2 * n)])
+        H = body.transform(X)
+        own = gains * (1.0 + differ * OF_GAINS * rng.normal(size=n))
+        clean = own * (H[:, :, : 10 * n] @ links) + H[:, :, 10 * n :] @ friction
+        return X, clean + NOISE * clean.std(axis=0) * rng.normal(size=clean.shape)
+
+    moves = [rows() for _ in range(3)]
+    X, y = (np.concatenate(one) for one in zip(*moves, strict=True))
+    true.inertias[true.njoints - 1] += pinocchio.Inertia(mass, com, 0.01 * np.eye(3))
+    with harness.one_thread():
+        model = InverseDynamics(nominal, gain_scale=cell.gain_scale, n_inducing=0)
+        model.fit(X, y, groups=np.repeat(range(3), len(X) // 3))
+        load = model.estimate_payload(*rows())
+    weights = dict(zip(model.coef_names_, zip(model.coef_, model.coef_std_, strict=True), strict=True))
+    found = [("mass", mass, load.mass, load.mass_std)]
+    found += [("com", *one) for one in zip(com, load.com, load.com_std, strict=True)]
+    for j, joint in enumerate(list(nominal.names)[1:]):
+        found += [(f"gain {j + 1}", gains[j], model.gains_[j], model.gains_std_[j])] if cell.gain_scale else []
+        for name, value in {"viscous": viscous[j], "coulomb": coulomb[j]}.items():
+            found.append((f"{name} {j + 1}", value, *weights[f"{name}({joint})"]))
+        # Intervals of velocities are those of their logarithms.
+        name = f"stiction_velocity({joint})"
+        value, std = model.theta_[name], model.theta_std_[name]
+        found.append((f"log velocity {j + 1}", np.log(velocity[j]), np.log(value), std / value))
+    return [{"part": name, "true": truth, "value": value, "std": std} for name, truth, value, std in found]
+
+
+def payload_tables(weighed: pd.DataFrame, carried: pd.DataFrame) -> harness.Tables:
+    """Return masses of the real load, and coverage of intervals of simulated arms and payloads."""
+    tables = {}
+    if len(weighed):
+        lines = []
+        for (trained, scale), own in weighed.groupby(["trained", "gain_scale"], sort=False):
+            whole, parts = own[own["part"] == "whole"].iloc[0], own[own["part"] != "whole"]
+            inside = (np.abs(own["value"] - own["true"]) <= INTERVAL * own["std"])[parts.index]
+            line = {"arm known from": trained.replace("+", " + "), "gain_scale": str(scale)}
+            line |= {"mass, kg": f"{whole['value']:.3f} ± {INTERVAL * whole['std']:.3f}"}
+            line |= {"z": f"{(whole['value'] - whole['true']) / whole['std']:.2f}"}
+            line |= {"fifths": f"{parts['value'].min():.2f} to {parts['value'].max():.2f}"}
+            line |= {"their scatter": f"{parts['value'].std():.3f}", "their std": f"{parts['std'].mean():.3f}"}
+            lines.append({**line, "intervals with the true mass": f"{inside.sum()} of {len(inside)}"})
+        tables["UR10e"] = pd.DataFrame(lines)
+    z = (carried["value"] - carried["true"]) / carried["std"]
+    part = carried["part"].str.replace(r" \d+$", "", regex=True)
+    rows = carried.assign(z=z, part=part, inside=np.abs(z) <= INTERVAL)
+    groups = rows.groupby(["gain_scale", "moves", "part"], sort=False)
+    table = groups.agg(
+        arms=("seed", "nunique"),
+        inside=("inside", "mean"),
+        z=("z", lambda z: np.sqrt(np.mean(z**2))),
+        std=("std", "median"),
+    ).reset_index()
+    table = table.assign(inside=text(table["inside"], 3), z=text(table["z"], 2))
+    names = {"part": "quantity", "inside": "within 95 %", "z": "rms z", "std": "median std"}
+    return tables | {"simulated": table.rename(columns=names)}
+
+
+def payload(options: Any, output: Path) -> tuple[harness.Tables, int]:
+    cells = [Carried(*cell, options.size) for cell in product(GAIN_SCALES, MOVES, options.seeds)]
+    n_failures = harness.run_missing(cells, carry, output, options.jobs)
+    second, weighed = output.with_name(f"{output.stem}_real.csv"), pd.DataFrame()
+    if options.data is not None:
+        folder = options.data.resolve()
+        empty, three = LOADS[0][1], SPLITS["ur10e"]["three"]
+        trained = [(empty,), *((name,) for name in three), three, (empty, *three)]
+        known = ["+".join(names) for names in trained[: 1 if options.size == "quick" else None]]
+        questions = [Weighed(names, scale, options.size) for names in known for scale in GAIN_SCALES]
+        n_failures += harness.run_missing(questions, partial(weigh, folder=folder), second, options.jobs)
+        weighed = harness.frame(second, size=options.size)
+    return payload_tables(weighed, harness.frame(output, size=options.size)), n_failures
+
+
 PARTS = {  # CSV, function, title
+    "payload": ("payload", payload, "Payloads, and friction, of arms"),
     "real": ("real_arms", real, "Torques of real arms"),
     "identification": ("identification", identification, "What is identified of a simulated arm"),
 }

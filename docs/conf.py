@@ -93,5 +93,6 @@ html_theme_options = {
 }
 # Pages on their own have nothing to list beside them; results are wide, and stories are listed by their pictures.
 ALONE = ["index", "start", "which_model", "comparison", "reproduction", "tests", "changelog", "generated/source/*"]
+ALONE += ["from_0_1_to_0_2"]
 ALONE += ["benchmarks", "generated/results/*", "auto_examples/*"]
 html_sidebars = {page: [] for page in ALONE}

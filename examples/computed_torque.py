@@ -1,7 +1,7 @@
-"""A simulated arm with a payload and friction that its model does not know, and a computed-torque controller.
+"""A simulated arm with an unknown payload and unknown friction, and a computed-torque controller.
 
-What `plot_tracking.py` and `benchmarks/control.py` share. Trajectories are arrays of shape (n_steps, n_runs,
-3 * n_joints) with rows [q, q̇, q̈]; all runs are simulated at once.
+`plot_tracking.py` and `benchmarks/control.py` use this module. Trajectories are arrays of shape (n_steps, n_runs,
+3 * n_joints) with rows [q, q̇, q̈]. All runs are simulated together.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from skevgp.datasets import load_robot, perturb_robot, quintic_reference
 from skevgp.features import RigidBodyRegressor
 from skevgp.robots import RigidBody
 
-# Of the controller, s. The simulator takes five steps of Runge and Kutta's method in it, for friction is stiff.
+# Time step of the controller, s. The simulator divides it into five Runge-Kutta steps, because friction is stiff.
 DT, SUBSTEPS = 0.005, 5
 KP, KD = 100.0, 20.0
 HOME = np.array([0.0, 0.8, 0.0, -1.2, 0.0, 0.8, 0.0])
-# Of what is logged, every so many steps: 50 Hz.
+# The log has every fourth state: 50 Hz.
 EVERY = 4
-# Of moves, rad/s, and s: no faster and no slower.
+# Largest speed of a move, rad/s, and its longest duration, s.
 FASTEST, SLOWEST = 2.2, 5.0
-# Where a move's torques are looked at before it runs.
+# Times of a move at which its torques are checked in advance.
 INSTANTS = np.linspace(0.0, 1.0, 51)
 
 
 @dataclass(frozen=True)
 class Arm:
-    """An iiwa14 as it is.
+    """The true iiwa14 of the simulation.
 
-    Joints have Coulomb's and viscous friction, which the learner's physics know, and what gears have beside it: more
-    friction at low speeds (Stribeck) and under load.
+    Its joints have Coulomb and viscous friction, which the learner's features include. They also have effects that the
+    features do not include: more friction at low speeds (Stribeck) and under load.
 
     Attributes
     ----------
     body : RigidBody
-        With its payload, and masses that are a little off.
+        The true bodies, with the payload.
     effort : ndarray of shape (n_joints,)
-        What motors can give, N m.
+        Torque limits of the motors, N m.
     coulomb, viscous, stribeck, load : ndarray of shape (n_joints,)
         N m, N m s, N m, and a share of the motor's torque.
     ripple, noise : ndarray of shape (n_joints,)
-        Standard deviations of what motors give beside what is asked, and of the torque sensors, N m.
+        Standard deviations of the errors of the motors and of the torque sensors, N m.
     """
 
     body: RigidBody
@@ -62,7 +62,7 @@ class Arm:
         return dry * np.tanh(v / 0.02) + self.viscous * v
 
     def step(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The state after DT of held torques."""
+        """Return the state after DT with constant torques."""
         h = DT / SUBSTEPS
 
         def rate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ class Arm:
 
 
 def make_arm(payload: float, seed: int) -> Arm:
-    """With a payload of so many kg, at a place in the hand that the seed draws, as it does friction."""
+    """Make an arm with a payload in kg. The seed draws its place in the hand and the friction."""
     rng = np.random.RandomState(seed)
     model = perturb_robot("iiwa14", 0.05, random_state=rng)
     model.armature = load_robot("iiwa14").armature  # a catalogue has it
@@ -96,14 +96,14 @@ def _carry(model: Any, payload: float, place: np.ndarray) -> None:
 
 
 def learner(payload: float = 2.5, **options: Any) -> InverseDynamics:
-    """Of the arm's torques; its prior is the nominal model with some load or other, a few kg more or less."""
+    """Make a model of the arm's torques. Its prior is the nominal model with an unknown load of a few kg."""
     model = load_robot("iiwa14").copy()
     _carry(model, payload, np.array([0.0, 0.0, 0.1]))
     return InverseDynamics(RigidBodyRegressor(model, mass_scale=1.0, com_scale=0.5), **options)
 
 
 class ComputedTorque:
-    """τ = M(q) (q̈_d + k_p e + k_d ė + k_i ∫e) + C(q, q̇) q̇ + g(q) of a model, e = q_d - q, and what it misses.
+    """τ = M(q) (q̈_d + k_p e + k_d ė + k_i ∫e) + C(q, q̇) q̇ + g(q) of a model, with e = q_d - q, and added torques.
 
     Parameters
     ----------
@@ -111,9 +111,9 @@ class ComputedTorque:
         The approximate model.
     reference : ndarray of shape (n_steps, n_runs, 3 * n_joints)
     missed : ndarray of shape (n_steps, n_runs, n_joints) or callable, default=None
-        Torques that are added, known ahead as the reference is; or what gives them of rows [q_d, q̇_d, q̈_d].
+        Torques to add: an array computed in advance, or a function of rows [q_d, q̇_d, q̈_d].
     ki : float, default=0.0
-        In 1/s³.
+        Integral gain, 1/s³.
     """
 
     def __init__(self, body: RigidBody, reference: np.ndarray, missed: Any = None, ki: float = 0.0):
@@ -136,14 +136,14 @@ class ComputedTorque:
 
 @dataclass(frozen=True)
 class Run:
-    """What happened.
+    """The result of a simulated run.
 
     Attributes
     ----------
     motion : ndarray of shape (n_steps, n_runs, 3 * n_joints)
         Means of q and q̇ over each step, and q̈ as the change of q̇.
     torque : ndarray of shape (n_steps, n_runs, n_joints)
-        As sensors at the joints measure it.
+        Torques measured by the joint sensors, N m.
     error : ndarray of shape (n_steps, n_runs, n_joints)
         Position minus reference, at the start of each step.
     """
@@ -154,7 +154,7 @@ class Run:
 
 
 def track(arm: Arm, controller: ComputedTorque, seed: int) -> Run:
-    """Follow the reference from its first state on; motors are as strong as they need to be."""
+    """Follow the reference from its first state, without torque limits."""
     rng, reference = np.random.RandomState(seed), controller.reference
     n = reference.shape[2] // 3
     q, v = reference[0, :, :n].copy(), reference[0, :, n : 2 * n].copy()
@@ -170,13 +170,13 @@ def track(arm: Arm, controller: ComputedTorque, seed: int) -> Run:
 
 
 def log_of(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows to learn from, X, y and which run they are of."""
+    """Return training rows X and y, and the run of each row."""
     X, y = (part[::EVERY].swapaxes(0, 1) for part in (run.motion, run.torque))
     return np.concatenate(X), np.concatenate(y), np.repeat(np.arange(len(X)), X.shape[1])
 
 
 def waves(n_runs: int, seconds: float, seed: int, slower: float = 1.0) -> np.ndarray:
-    """Sums of three waves of each joint about HOME, of up to half a turn per second or so."""
+    """Return sums of three waves of each joint about HOME, with speeds up to about half a turn per second."""
     rng, t = np.random.RandomState(seed), DT * np.arange(round(seconds / DT))[:, np.newaxis, np.newaxis, np.newaxis]
     omega = 2.0 * np.pi * rng.uniform(0.05, 0.7, (n_runs, len(HOME), 3)) / slower
     phase, size = rng.uniform(0.0, 2.0 * np.pi, omega.shape), rng.uniform(0.1, 0.35, omega.shape)
@@ -187,7 +187,7 @@ def waves(n_runs: int, seconds: float, seed: int, slower: float = 1.0) -> np.nda
 
 
 def moves(starts: np.ndarray, ends: np.ndarray, durations: np.ndarray, seconds: float) -> np.ndarray:
-    """A minimum-jerk motion of each run between two positions, which is then held."""
+    """Return a minimum-jerk motion of each run between two positions. The last position is then held."""
     t = DT * np.arange(round(seconds / DT))
     each = [
         np.concatenate(quintic_reference(*ends_, duration, t), axis=1)
@@ -197,27 +197,28 @@ def moves(starts: np.ndarray, ends: np.ndarray, durations: np.ndarray, seconds: 
 
 
 def missed_by(body: RigidBody, model: Any, reference: np.ndarray) -> np.ndarray:
-    """Torques along a reference that a learned model of torques adds to those of the nominal one, in one batch."""
+    """Return the difference between learned and nominal torques along a reference, in one batch."""
     rows = reference.reshape(-1, reference.shape[-1])
     missed = model.predict(rows) - body.forces(*np.split(rows, 3, axis=1))
     return missed.reshape(*reference.shape[:-1], -1)
 
 
 def cautious(chance: float, n_joints: int, n_steps: int) -> float:
-    """How many standard deviations keep all torques of a move within limits with this probability, by Boole's bound."""
+    """Return k such that mean ± k std keeps all torques of a move within limits with this probability (Boole)."""
     return float(norm.isf((1.0 - chance) / (n_joints * n_steps)))
 
 
 def fastest(
     model: Any, starts: np.ndarray, ends: np.ndarray, limits: np.ndarray, k: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The shortest durations of moves in which |mean| + k std of all torques stay within limits, by bisection.
+    """Find the shortest durations of moves for which |mean| + k std of all torques is within limits, by bisection.
 
     Returns
     -------
     durations : ndarray of shape (n_moves,)
     decided : ndarray of bool of shape (n_moves,)
-        Whether torques decide: neither the limit of speeds, nor that the arm cannot hold its load there at all.
+        Whether torque limits determine the duration. It is false if the limit of speeds does, or if the arm cannot
+        hold its load at that position.
     """
     q, v, a = quintic_reference(starts, ends, 1.0, INSTANTS)
 
@@ -237,6 +238,6 @@ def fastest(
 
 
 def positions(n_moves: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where moves start and end."""
+    """Draw positions at which moves start and end."""
     starts, ends = HOME + np.random.RandomState(seed).uniform(-0.7, 0.7, (2, n_moves, len(HOME)))
     return starts, ends

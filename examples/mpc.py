@@ -1,6 +1,6 @@
-"""Model predictive control on a learned model: iLQR with a limit on the input, planned anew at each step.
+"""Model predictive control on a learned model: iLQR with a limit on the input, and a new plan at each step.
 
-What `plot_swing_up.py` and `benchmarks/control.py` share.
+`plot_swing_up.py` and `benchmarks/control.py` use this module.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ from skevgp.datasets import make_dynamics, simulate
 from skevgp.features import AngleEncoder, InertiaForceGravity
 
 DT = 0.03
-# Of a trajectory to learn from, steps.
+# Number of steps of a training trajectory.
 LENGTH = 10
-# What counts as upright, rad, and how many steps it must last.
+# Largest angle that counts as upright, rad, and the number of steps that it must last.
 NEAR, LAST = 0.1, 34
-# Of the line search, all tried at once.
+# Step lengths of the line search, evaluated together.
 STEPS = 0.5 ** np.arange(8)[:, np.newaxis]
 
 
 @dataclass(frozen=True)
 class Task:
-    """To swing a pole up, and to keep it there.
+    """The task to swing a pole up and to balance it.
 
-    What it costs is the square of weights * (encoded row - goal), where the encoded row has sines and cosines in place
-    of angles, and the input as its last column.
+    The cost is the square of weights * (encoded row - goal). The encoded row has sines and cosines instead of angles,
+    and the input as its last column.
 
     Attributes
     ----------
     system : str
     limit : float
-        Of the force or torque, N or N m.
+        Limit of the force or torque, N or N m.
     goal, weights, last_weights : tuple of float
-        For each column of the encoded row; the last are those of the horizon's end.
+        Values for each column of the encoded row. ``last_weights`` is for the end of the horizon.
     pole : int
-        The column of the pole's angle, which hangs at 0.
+        Column of the pole's angle. The pole hangs at 0.
     horizon, n_steps : int
-        Steps of a plan, and of the whole.
+        Number of steps of a plan, and of the whole run.
     caution : float, default=0.0
-        What is not known of a step costs the square of caution * std: else plans seek out the model's mistakes.
+        The square of caution * std is added to the cost. Without it, plans exploit errors of the model.
     """
 
     system: str
@@ -58,7 +58,7 @@ class Task:
 
 
 TASKS = {
-    # The torque would hold the pendulum at 24 degrees at most: it has to swing.
+    # The torque can hold the pendulum at 24 degrees at most, so it has to swing.
     "pendulum": Task(
         "pendulum",
         limit=2.0,
@@ -84,12 +84,12 @@ TASKS = {
 
 
 class Planner:
-    """iLQR: the model's derivatives along a plan give a linear-quadratic problem, whose solution is the next plan.
+    """iLQR: derivatives of the model along a plan give a linear-quadratic problem. Its solution is the next plan.
 
     Parameters
     ----------
     model : CompiledPredictor
-        Or what has its `predict` and `value_and_jacobian`: rows are [state, input], with one input.
+        Or an object with the same `predict` and `value_and_jacobian`. Rows are [state, input], with one input.
     task : Task
 
     Attributes
@@ -97,9 +97,9 @@ class Planner:
     U : ndarray of shape (horizon, 1)
         The plan.
     Z : ndarray of shape (horizon + 1, n_states)
-        Where it leads, as the model says.
+        Predicted states of the plan.
     gain : ndarray of shape (horizon, n_states)
-        How inputs answer to states that are others than planned.
+        Feedback gains on deviations from the planned states.
     cost : float
     """
 
@@ -122,12 +122,12 @@ class Planner:
         self.cost, self.U, self.Z, self.gain = best
 
     def move_on(self, z: np.ndarray, n_iter: int = 3) -> None:
-        """Plan from the next state: the plan is moved on by a step, and improved from there."""
+        """Plan from the next state. Shift the plan by a step and improve it."""
         self.U, self.Z, self.gain = (np.concatenate([part[1:], part[-1:]]) for part in (self.U, self.Z, self.gain))
         self.improve(z, n_iter)
 
     def improve(self, z: np.ndarray, n_iter: int) -> None:
-        """Iterate, from where the plan and its answers to deviations lead from z."""
+        """Iterate, from the states to which the plan and its gains lead from z."""
         U, Z = self._forward(z, np.zeros(len(self.U)), self.gain, np.zeros((1, 1)))
         self.U, self.Z, self.cost = U[0], Z[0], float(self._costs(Z, U)[0])
         damping = 1e-3
@@ -141,7 +141,7 @@ class Planner:
                 damping *= 10.0
 
     def _iterate(self, damping: float) -> bool:
-        """Whether the plan became better."""
+        """Return whether the plan became better."""
         change, gain = self._backward(damping)
         U, Z = self._forward(self.Z[0], change, gain, STEPS)
         costs = self._costs(Z, U)
@@ -153,7 +153,7 @@ class Planner:
         return True
 
     def _residuals(self, Z: np.ndarray, U: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows [state, input] along plans, also of the state at the end, and what they cost, before it is squared."""
+        """Return rows [state, input] along plans, and their costs before squaring. The last state is included."""
         rows = np.concatenate([Z, np.concatenate([U, np.zeros_like(U[..., :1, :])], axis=-2)], axis=-1)
         encoded = self._encoder.transform(rows.reshape(-1, rows.shape[-1]))
         return rows, self._weights * (encoded.reshape(*rows.shape[:-1], -1) - self._goal)
@@ -167,7 +167,7 @@ class Planner:
         return costs
 
     def _backward(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """By how much inputs should change, and how they should answer to states that are others than planned."""
+        """Return changes of the inputs, and feedback gains on deviations from the planned states."""
         rows, residuals = self._residuals(self.Z, self.U)
         _, slopes, *spread = self.model.value_and_jacobian(rows[:-1], return_std=self.task.caution > 0.0)
         by_rows = self._weights[:, :, np.newaxis] * self._encoder.jacobian(rows)
@@ -196,7 +196,7 @@ class Planner:
     def _forward(
         self, z: np.ndarray, change: np.ndarray, gain: np.ndarray, steps: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """New plans from z, one for each length of the step."""
+        """Return new plans from z, one for each step length."""
         Z = np.empty((len(steps), *self.Z.shape))
         U = np.empty((len(steps), *self.U.shape))
         Z[:, 0] = z
@@ -216,21 +216,21 @@ def learn(
     length: int = LENGTH,
     **settings: Any,
 ) -> Bunch:
-    """Learn a system from trajectories that start anywhere.
+    """Learn a system from trajectories with random first states.
 
     Parameters
     ----------
     system : str
     seconds : float
-        Of data, in trajectories of ``length`` steps.
+        Duration of the data, in trajectories of ``length`` steps.
     physics : bool
-        Whether the model knows rough physics (EVGP-IFG), or is a Gaussian process of the change of state.
+        Whether to use features of rough physics (EVGP-IFG). If False, a Gaussian process learns the change of state.
     noise : float, default=0.0
-        On all states, as a share of their scatter.
+        Noise on all states, relative to their scatter.
     seed : int, default=0
     length : int, default=LENGTH
     **settings
-        For `EVGPRegressor`.
+        Arguments of `EVGPRegressor`.
 
     Returns
     -------
@@ -259,7 +259,7 @@ def swing_up(model: Any, task: Task, noise: np.ndarray | float = 0.0, seed: int 
     noise : ndarray of shape (n_states,) or float, default=0.0
         Standard deviation of the noise on the states that the planner sees.
     seed : int, default=0
-        Of the first plans and the noise.
+        Seed of the first plans and of the noise.
 
     Returns
     -------

@@ -2,10 +2,10 @@
 Learn any robot's dynamics
 ==========================
 
-A robot's name, or the path of its URDF file, is all that simulation and features need. Here it is the arm UR5 of the
-package example-robot-data. Four models are compared by cross-validation over its moves: a sparse Gaussian process
-alone, with inertia and force (IF), with gravity on the links too (IFG), and with a URDF file whose masses are wrong.
-Run ``python examples/plot_any_robot.py --robot acrobot`` for another robot, and ``--help`` for options.
+A robot's name, or the path of its URDF file, is enough for simulations and features. This example uses the arm UR5 of
+the package example-robot-data. Cross-validation over moves compares four models. The first is a sparse Gaussian process
+alone. The others have features: inertia and force (IF), also gravity on the links (IFG), and a URDF file with wrong
+masses. Run ``python examples/plot_any_robot.py --robot acrobot`` for another robot, and ``--help`` for options.
 """
 
 # %%
@@ -49,8 +49,8 @@ n_trajectories = (30 if quick else 60) if options.trajectories is None else opti
 n_folds, n_inducing, sharing = (2, 15, "all") if quick else (3, 30, "none")
 
 # %%
-# The robot, and its moves under computed-torque control
-# ------------------------------------------------------
+# Simulate moves under computed-torque control
+# --------------------------------------------
 
 try:
     import matplotlib.pyplot as plt
@@ -67,12 +67,12 @@ print(f"{robot.name}, one of {len(list_robots())} known robots: joints {', '.joi
 print(f"{n_trajectories} moves, {len(moves.data)} rows of {moves.data.shape[1]} columns, seed {options.seed}")
 
 # %%
-# Four models
-# -----------
-# The kernel of the last three sees sines and cosines of the angles: what angles do to the change of state repeats after
-# a turn. (A GP alone has to predict the angles themselves, which do not.) The masses, centres of mass and inertias of
-# the URDF file are made wrong by up to 20 %, as a real robot's may be. Shoulder and wrist have little in common: each
-# output has a kernel and inducing points of its own. ``tol=10`` ends the search for the last few nats of the bound.
+# Define four models
+# ------------------
+# The kernel of the last three models has sines and cosines of the angles as inputs, since the change of state is
+# periodic in the angles. A Gaussian process alone predicts the angles themselves, which are not periodic. The masses,
+# centres of mass and inertias of the URDF file are wrong by up to 20 %. Shoulder and wrist differ, so each output has
+# its own kernel and inducing points. ``tol=10`` ends the search early, a few nats below the maximum of the bound.
 
 wrong = perturb_robot(robot, 0.2, random_state=options.seed)
 settings = {"n_inducing": n_inducing, "sharing": sharing, "solver": LBFGS(tol=10.0)}
@@ -86,11 +86,11 @@ models = {
 }
 
 # %%
-# Cross-validation over moves
-# ---------------------------
-# ``GroupKFold`` keeps the rows of a move together: neighbours in time would give the answer away. CR-2 is the share of
-# truths within two standard deviations; 0.954 would be right. ``fit`` is told the moves too (``params``), and sets
-# noise and signal by those that it leaves out itself.
+# Cross-validate over moves
+# -------------------------
+# ``GroupKFold`` keeps all rows of a move together, because neighbouring rows are alike. CR-2 is the share of true
+# values within two standard deviations. The right value is 0.954. ``fit`` also gets the moves (``params``), and sets
+# noise and signal on held-out moves.
 
 splits = {"groups": moves.groups, "cv": GroupKFold(n_folds), "return_estimator": True, "return_indices": True}
 splits["params"] = {"groups": moves.groups}
@@ -117,9 +117,9 @@ for name, model in models.items():
         print(f"    a fit warned: {message}")
 
 # %%
-# A move that the models have not seen
-# ------------------------------------
-# How much the velocities of the two most restless joints change in a step, as predicted one step ahead.
+# Predict a new move
+# ------------------
+# The plot shows the change of two joint velocities in one step. These joints move the most.
 
 rows = moves.groups == 0
 seconds = moves.dt * (1 + np.arange(rows.sum()))

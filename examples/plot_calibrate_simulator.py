@@ -2,16 +2,17 @@
 Calibrate a simulator
 =====================
 
-A simulator has parameters that nobody has measured: the length of a pole, its friction. Here a regressor learns them
-from data, with intervals, together with a Gaussian process for what the simulator lacks. A second part asks what a
-parameter means if the simulator is wrong.
+A simulator has parameters that nobody has measured, such as the length of a pole and its friction. Here a regressor
+learns them from data, with intervals. A Gaussian process learns the residual of the simulator. The second part shows
+the meaning of a parameter if the simulator is wrong.
 """
 
 # %%
-# The simulator
-# -------------
-# It is a function in autograd.numpy: the change of a pendulum's angular velocity in 0.03 s, for rows of angle, velocity
-# and torque. Its friction is viscous, and dry with a Stribeck effect: it is larger at low speed.
+# Define the simulator
+# --------------------
+# The simulator is a function in autograd.numpy. It computes the change of a pendulum's angular velocity in 0.03 s, for
+# rows of angle, velocity and torque. Its friction is viscous, and dry with a Stribeck effect: it is larger at low
+# speed.
 
 import os
 
@@ -41,9 +42,9 @@ def change(X, ripple=0.0, **theta):
 
 
 # %%
-# Data
-# ----
-# The real motor has a ripple, a torque that depends on the angle. The simulator does not know it.
+# Simulate data
+# -------------
+# The real motor has a ripple, a torque that depends on the angle. The simulator does not include it.
 
 true = {"length": 0.5, "damping": 0.1, "coulomb": 0.2, "stribeck_velocity": 0.5}
 rng = np.random.default_rng(1)
@@ -54,8 +55,8 @@ y = y + 0.01 * np.std(y) * rng.standard_normal(len(y))
 # %%
 # Learn the parameters
 # --------------------
-# Each parameter has a prior. Here their medians are 20 % too large. ``CoefPrior(mean=1.0, scale=0.0)`` says that the
-# simulator counts as it is. Its output is not multiplied by a weight.
+# Each parameter has a prior. Here the medians are 20 % too large. ``CoefPrior(mean=1.0, scale=0.0)`` fixes the weight
+# of the simulator at 1.
 
 priors = {name: LogNormal(1.2 * value, 0.4) for name, value in true.items()}
 units = {"length": "m", "damping": "N m s/rad", "coulomb": "N m", "stribeck_velocity": "rad/s"}
@@ -65,7 +66,7 @@ learned = EVGPRegressor(ParametricFeatures(change, priors, units), **options).fi
 print(learned.summary())
 
 # %%
-# The same simulator with parameters that stay 20 % off needs more of the Gaussian process:
+# If the parameters stay 20 % wrong, the Gaussian process has to explain more:
 
 off = {name: 1.2 * value for name, value in true.items()}
 fixed = EVGPRegressor(FunctionTransformer(lambda X: change(X, **off).reshape(-1, 1)), **options).fit(X, y)
@@ -76,11 +77,11 @@ for name, error in errors.items():
     print(f"{name:14s} RMSE {error:.4f} rad/s")
 
 # %%
-# A simulator that is wrong
-# -------------------------
-# Plumlee (2017) simulates 4 x + x sin(5 x) by a line θ x. No θ is right. With ``discrepancy="free"`` the Gaussian
-# process may imitate the line, so that θ can be nearly anything. With ``"orthogonal"``, θ is the best fit in least
-# squares, which the data determine well. Predictions are the same.
+# Calibrate a wrong simulator
+# ---------------------------
+# Plumlee (2017) simulates 4 x + x sin(5 x) by a line θ x. No θ is right. With ``discrepancy="free"``, the Gaussian
+# process can imitate the line, so θ is very uncertain. With ``"orthogonal"``, θ is the best fit in least squares, which
+# the data determine well. Predictions are the same.
 
 
 def line(X, slope):
@@ -97,8 +98,8 @@ for discrepancy in ("free", "orthogonal"):
     lines[discrepancy] = model
 
 # %%
-# Pictures
-# --------
+# Plot the results
+# ----------------
 
 figure, ((of_theta, of_errors), (free, orthogonal)) = plt.subplots(2, 2, figsize=(8, 6.4))
 for place, name in enumerate(true):

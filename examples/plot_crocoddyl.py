@@ -1,14 +1,14 @@
 """
-A learned model in Crocoddyl
-============================
+Plan with Crocoddyl on a learned model
+======================================
 
-`Crocoddyl <https://github.com/loco-3d/crocoddyl>`_ plans a robot's motions by differential dynamic programming, and
-asks two things of a model: where a step leads, and how that changes with state and input. ``compile()`` of a fitted
-model answers both, so that an ``ActionModel`` of a learned system is a page of code. Here FDDP swings a pole up on a
-model of seconds of data, starting from a guess that no system could follow, the pole upright from the first step on.
-The plan is then replayed on the simulated system, as it is and with the gains that FDDP gives beside it, and a rollout
-says beforehand how far the true system may stray. Run ``python examples/plot_crocoddyl.py --system pendulum`` for a
-pendulum whose motor is too weak to lift it in one go, and ``--help`` for options.
+`Crocoddyl <https://github.com/loco-3d/crocoddyl>`_ plans motions of robots by differential dynamic programming (FDDP).
+It needs the next state and its derivatives in state and input. ``compile()`` of a fitted model computes both, so the
+``ActionModel`` is short. Here FDDP swings up a pole on a model learned from seconds of data. The simulated system then
+runs the plan with and without the feedback gains of FDDP. A rollout of the model predicts the errors in advance.
+
+Run ``python examples/plot_crocoddyl.py --system pendulum`` for a pendulum with a weak motor, and ``--help`` for
+options.
 """
 
 # %%
@@ -31,7 +31,7 @@ from skevgp.datasets import simulate
 from skevgp.features import AngleEncoder
 
 SECONDS = {"pendulum": 1.5, "cartpole": 4.5}
-# Steps in which the pole can be brought up.
+# Number of steps for the swing-up.
 FIRST = {"pendulum": 100, "cartpole": 50}
 
 parser = argparse.ArgumentParser(description="Swing a pole up with Crocoddyl, on a model learned from data.")
@@ -61,23 +61,23 @@ except ImportError as error:
     sys.exit(f"error: {error}\nThis example needs Pinocchio, Crocoddyl and matplotlib: {packages}")
 
 # %%
-# The learned system as Crocoddyl sees it
-# ---------------------------------------
-# ``calc`` is asked for the next state and the cost, ``calcDiff`` for their derivatives at the same place. The cost is
-# half the square of what is in ``r``, so that its second derivatives are those of Gauss and Newton.
+# Define an action model for Crocoddyl
+# ------------------------------------
+# ``calc`` computes the next state and the cost. ``calcDiff`` computes their derivatives at the same point. The cost is
+# half the sum of squares of ``r``, so its second derivatives are Gauss-Newton approximations.
 
 
 class LearnedAction(crocoddyl.ActionModelAbstract):
-    """A step of a learned system, and what it costs to be away from a goal.
+    """A step of a learned system, with the cost of the distance from a goal.
 
     Parameters
     ----------
     model : CompiledPredictor
-        Of rows [state, input].
+        Predictor for rows [state, input].
     task : Task
-        With goal and limit.
+        Goal and limit of the input.
     weights : array-like
-        Of the encoded row, which has sines and cosines in place of angles.
+        Weights of the encoded row, which has sines and cosines instead of angles.
     """
 
     def __init__(self, model, task, weights):
@@ -88,7 +88,7 @@ class LearnedAction(crocoddyl.ActionModelAbstract):
         self.u_lb, self.u_ub = np.array([-task.limit]), np.array([task.limit])
 
     def calc(self, data, x, u=None):
-        """Without an input, as at the horizon's end, the state stays."""
+        """Compute next state and cost. Without an input, at the end of the horizon, the state does not change."""
         row = np.append(x, 0.0 if u is None else u)
         data.xnext = x if u is None else self.model.predict(row)
         data.r = self.weights * (self.encoder.transform(row[np.newaxis])[0] - self.goal)
@@ -106,12 +106,12 @@ class LearnedAction(crocoddyl.ActionModelAbstract):
 
 
 # %%
-# Learn, and plan
-# ---------------
-# Data are short trajectories from random states, with random inputs. FDDP need not start from a motion that is
-# possible: the pole is upright from the first step on, and the gaps between its steps close as it iterates. (From rest,
-# without a push, it would stay there: hanging is stationary.) Its box version keeps the motor's limit. The first plan
-# has just the time to come up, since with more of it FDDP finds detours; one of all steps begins with it.
+# Learn the model and plan
+# ------------------------
+# Data are short trajectories from random states with random inputs. FDDP can start from an impossible motion. Here the
+# pole is upright from the first step, and iterations close the gaps between steps. From rest at the bottom it would
+# stay there, because hanging is stationary. The box version of FDDP keeps the limit of the motor. The first plan is
+# short, because FDDP finds detours in long ones. The final plan starts from the first one.
 
 try:
     start = time.perf_counter()
@@ -126,7 +126,7 @@ rest = np.zeros(each_step.state.nx)
 
 
 def plan(Z, U):
-    """FDDP from a guess: the solver, and what each of its iterations came to."""
+    """Run FDDP from a guess. Return the solver and the log of its iterations."""
     solver = crocoddyl.SolverBoxFDDP(crocoddyl.ShootingProblem(rest, [each_step] * len(U), last))
     solver.th_stop, log = 1e-3, crocoddyl.CallbackLogger()
     solver.setCallbacks([log])
@@ -138,7 +138,7 @@ def plan(Z, U):
 
 
 def goal(z):
-    """At rest, upright on the side that is nearest to the pole of a state."""
+    """Return the state at rest, upright on the side nearest to the pole of a state."""
     upright = np.zeros_like(rest)
     upright[task.pole] = np.pi * (1.0 + 2.0 * np.round((z[task.pole] / np.pi - 1.0) / 2.0))
     return upright
@@ -152,12 +152,12 @@ Z, U = np.array(solver.xs), np.array(solver.us)
 gains = np.array(solver.K).reshape(task.n_steps, 1, -1)
 
 # %%
-# Are the derivatives right?
-# --------------------------
-# Crocoddyl's own answer: differences of ``calc``, at states and inputs along the plan.
+# Check the derivatives
+# ---------------------
+# Crocoddyl computes finite differences of ``calc`` at states and inputs along the plan.
 
 differences = crocoddyl.ActionModelNumDiff(each_step, True)
-differences.disturbance = 1e-5  # a larger step than its own, of which rounding would be a large share
+differences.disturbance = 1e-5  # larger than the default, because of rounding
 furthest = dict.fromkeys(("Fx", "Fu", "Lx", "Lu", "Lxx", "Lxu", "Luu"), 0.0)
 for z, u in zip(Z[:-1:10], U[::10], strict=True):
     pair = each_step.createData(), differences.createData()
@@ -170,15 +170,15 @@ for z, u in zip(Z[:-1:10], U[::10], strict=True):
 print("off Crocoddyl's differences:", ", ".join(f"{name} {off:.0e}" for name, off in furthest.items()), flush=True)
 
 # %%
-# Replay
-# ------
-# Upright is unstable: what the model does not know grows along an open loop, and FDDP's gains bring it back. A rollout
-# of the model under the same gains, each particle following one function of the posterior, says beforehand how far the
-# true system may stray: by so much does the plan rely on what is not known, and some particles may fall.
+# Run the plan on the true system
+# -------------------------------
+# The upright position is unstable. In an open loop, errors of the model grow. The gains of FDDP correct them. The
+# rollout uses the same gains, and each particle follows one function of the posterior. It shows in advance how far the
+# true system may deviate. Some particles may fall.
 
 
 def controller(z, t):
-    """The plan, and how it answers to states that are others than planned."""
+    """Return the input of the plan, with feedback on deviations from the planned states."""
     return np.clip(U[t] - (z - Z[t]) @ gains[t].T, -task.limit, task.limit)
 
 
@@ -190,7 +190,7 @@ ahead = rollout(learned.model, rest, controller, n_steps=task.n_steps, n_samples
 
 
 def off_upright(states):
-    """Of the pole, rad."""
+    """Return the distance of the pole from upright, rad."""
     return np.abs(states[..., task.pole] % (2.0 * np.pi) - np.pi)
 
 
@@ -203,8 +203,8 @@ for name, states in runs.items():
 print(f"in the model, with the gains, {particles.sum()} of {n_particles} particles are", flush=True)
 
 # %%
-# Plan, replays, and what was known of them
-# -----------------------------------------
+# Plot the plan and the runs
+# --------------------------
 
 colours = {"inputs as planned": "#D55E00", "with FDDP's gains": "#0072B2"}
 times, pole = DT * np.arange(task.n_steps + 1), task.pole

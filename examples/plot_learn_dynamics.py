@@ -2,10 +2,10 @@
 Learn a robot's dynamics with rough physics
 ===========================================
 
-From simulated trajectories, four models learn to predict a system's next state from its state and input: a sparse
-Gaussian process (VGP), the same on the change of state (RES-VGP), and the EVGP with inertia and force (EVGP-IF) or
-inertia, force and gravity (EVGP-IFG) as explicit features. The physics is rough: it knows no mass, no length and no
-friction. Run ``python examples/plot_learn_dynamics.py --help`` for options.
+Four models learn to predict a system's next state from its state and input, from simulated trajectories. The first is a
+sparse Gaussian process (VGP). RES-VGP is the same for the change of state. EVGP-IF has inertia and force as explicit
+features, and EVGP-IFG also has gravity. The physics is rough: the features contain no mass, length or friction. Run
+``python examples/plot_learn_dynamics.py --help`` for options.
 """
 
 # %%
@@ -27,7 +27,7 @@ from skevgp.metrics import containing_ratios, prediction_error, std_norm
 from skevgp.plotting import CoefficientDisplay
 from skevgp.solvers import Adam
 
-# Inducing points (the paper's Table 2) of VGP and RES-VGP, and of EVGP.
+# Number of inducing points in the paper's Table 2, of VGP and RES-VGP, and of EVGP.
 INDUCING = {"pendulum": (40, 10), "cartpole": (100, 60), "acrobot": (250, 150)}
 # Error, ‖STD‖, CR-1, CR-2, CR-3 and parameters in the paper's Table 4.
 PAPER = {
@@ -79,8 +79,8 @@ if os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1":
 m_vgp, m_evgp = options.inducing or INDUCING[options.system]
 
 # %%
-# Data: trajectories for training, and others for testing
-# -------------------------------------------------------
+# Simulate trajectories for training and testing
+# ----------------------------------------------
 
 try:
     import matplotlib.pyplot as plt
@@ -95,9 +95,9 @@ except ValueError as error:
     sys.exit(f"error: {error}")
 
 # %%
-# Models
-# ------
-# RES-VGP predicts the change of state; the EVGP models know that a position moves with its velocity.
+# Fit the models
+# --------------
+# RES-VGP predicts the change of state. In the EVGP models, the features already move a position by its velocity.
 
 settings = {"solver": options.solver, "random_state": options.seed}
 if options.solver == "adam":
@@ -135,10 +135,10 @@ for name, model in models.items():
     )
 
 # %%
-# The hardest test trajectory, and the weights beside their prior
-# ---------------------------------------------------------------
-# The trajectory is the one where VGP errs most: it leaves the range of the training data. The prior's mean knows that
-# velocity moves position and stays as it is; the rest has mean 0 and a wide scale.
+# Plot the hardest trajectory and the weights
+# -------------------------------------------
+# This is the trajectory with the largest error of VGP. It leaves the range of the training data. In the prior mean,
+# velocity moves position and stays constant. All other weights have mean 0 and a wide scale.
 
 output = n_states - 1
 errors_vgp = np.abs(test.target - predictions["VGP"][0]).sum(axis=1)
@@ -158,7 +158,7 @@ for name, colour in colours.items():
     axes[1, 0].plot(seconds, 2 * std, color=colour, linestyle=":", label=f"{name}: 2 std")
 axes[0, 0].plot(seconds, truth, "k--", linewidth=1, label="truth")
 axes[0, 0].set(title="One-step predictions along a test trajectory, ±2 std", ylabel=velocity)
-axes[1, 0].set(title="Their errors, and what they promise", ylabel=velocity, yscale="log", xlabel="time (s)")
+axes[1, 0].set(title="Errors and standard deviations", ylabel=velocity, yscale="log", xlabel="time (s)")
 for ax in axes[:, 0]:
     ax.legend(loc="upper left")
 for ax, state in zip(axes[:, 1], range(n_states - 2, n_states), strict=True):

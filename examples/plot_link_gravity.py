@@ -1,12 +1,12 @@
 """
-What a link's gravity features can say
-======================================
+Gravity features of a robot's links
+===================================
 
-For each link, ``LinkGravity`` gives the torque of gravity about the link's own axis for a unit mass on a unit lever:
-one feature for a lever along u_x, one along u_y. Masses and centres of mass are left to the weights. Here the weights
-are fitted to random poses of two arms, by plain least squares, and looked at along a swing that they have not seen:
-where they give gravity's torque exactly, where they come near, and where they cannot.
-Run ``python examples/plot_link_gravity.py --help`` for options.
+For each link, ``LinkGravity`` computes the torque of gravity about the link's own axis, for a unit mass on a unit
+lever. One feature is for a lever along u_x, another for one along u_y. The weights stand for masses and centres of
+mass. Here least squares fits the weights to random poses of two arms. A test on a new swing shows where the features
+are exact, where they are approximate, and where they fail. Run ``python examples/plot_link_gravity.py --help`` for
+options.
 """
 
 # %%
@@ -37,9 +37,10 @@ quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 n_poses, n_steps = (200, 20) if quick else (2000, 50)
 
 # %%
-# Two arms, random poses, and a swing from rest without motors
-# ------------------------------------------------------------
-# The truth is Pinocchio's generalised gravity: the torque that holds the arm still.
+# Simulate two arms
+# -----------------
+# The data are random poses, and a swing from rest without motors. The true value is Pinocchio's generalised gravity,
+# the torque that holds the arm still.
 
 try:
     import matplotlib.pyplot as plt
@@ -57,7 +58,7 @@ def torque(robot, positions):
 
 
 def rows(positions):
-    """[q, q̇, u] at rest."""
+    """Return rows [q, q̇, u] at rest."""
     return np.hstack([positions, np.zeros((len(positions), 2 * positions.shape[1]))])
 
 
@@ -71,14 +72,14 @@ for name, start in starts.items():
 times = 0.03 * np.arange(n_steps + 1)
 
 # %%
-# Fit the torque at a joint to features, and look at it along the swing
-# ---------------------------------------------------------------------
-# The paper's formula is the lever u_x alone. Which of the two levers carries the weight is a matter of how the
-# model's frames lie: iiwa14's links lie along u_y, UR5's, which turn about y, along u_x.
+# Fit the torque at a joint
+# -------------------------
+# The paper's formula has the lever u_x only. The frames of the model decide which lever matters. The links of iiwa14
+# lie along u_y. Those of UR5 turn about y and lie along u_x.
 
 
 def along_the_swing(name, joint, **levers):
-    """Fitted weights (kg m) and the torque (N m) along the swing."""
+    """Return the fitted weights (kg m) and the torque (N m) along the swing."""
     robot = robots[name]
     features = LinkGravity(robot, **levers)
     fit = LinearRegression(fit_intercept=False).fit(
@@ -110,10 +111,11 @@ for name, joint, choices in cases:
         print(f"{name + ', ' + joint:28s}{size:17.3f}   {label:22s}{error:15.3f}{error / size:8.1%}")
 
 # %%
-# A weight is a mass times its lever
-# ----------------------------------
-# At iiwa14's joint 6 only link 7 follows, and its centre of mass lies on its own axis: at a fixed place of link 6. The
-# weights are minus the first moment of both about the joint, as the torque that holds them is minus gravity's.
+# Compare a weight with mass times lever
+# --------------------------------------
+# Only link 7 follows joint 6 of iiwa14. Its centre of mass lies on its own axis, at a fixed place of link 6. The
+# weights are minus the first moment of both links about the joint, because the holding torque is minus the torque of
+# gravity.
 
 weights, _ = along_the_swing("iiwa14", 5, links=["q6"])
 arm = robots["iiwa14"]
@@ -122,11 +124,11 @@ moment += arm.inertias[7].mass * arm.jointPlacements[7].act(arm.inertias[7].leve
 print(f"weight of u_y at iiwa14's q6: {weights[1]:.4f} kg m; the model's mass times lever: {moment[1]:.4f} kg m")
 
 # %%
-# The swing
-# ---------
-# Exact at q6 of iiwa14, whose one later link is carried at a fixed place, and at UR5's shoulder, where the later
-# joints that matter turn about parallel axes. At iiwa14's q2 other joints turn the arm about axes that themselves turn
-# in the frame of link 2: no weights fit. What is left over there is for the Gaussian process.
+# Plot the swing
+# --------------
+# The features are exact at q6 of iiwa14, where the one later link has a fixed place. They are also exact at UR5's
+# shoulder, where the later joints turn about parallel axes. At q2 of iiwa14, other axes turn in the frame of link 2,
+# and no weights fit. A Gaussian process has to learn this residual.
 
 figure, axes = plt.subplots(2, 2, figsize=(8, 5.6), sharex=True)
 features = LinkGravity("iiwa14", links=["q6"])

@@ -1,11 +1,12 @@
 """
-A wrong model as a prior
-========================
+Use a wrong model as a prior
+============================
 
-A robot's URDF file is rarely right: here every mass, centre of mass, inertia and rotor inertia of the arm iiwa14 is
-wrong by up to 20 %. ``NominalDynamics`` makes the accelerations of such a model features, with weights that start at
-Δt; data correct them, and a Gaussian process learns what is left. Beside it stands InertiaForceGravity (IFG), which
-knows how joints and gravity act and no number. Run ``python examples/plot_nominal_dynamics.py --help`` for options.
+The URDF file of a robot is rarely exact. Here each mass, centre of mass, inertia and rotor inertia of the arm iiwa14 is
+wrong by up to 20 %. ``NominalDynamics`` uses the accelerations of this model as features, and the prior mean of their
+weights is Δt. Data correct the weights, and a Gaussian process learns the residual. The other model,
+InertiaForceGravity (IFG), has rough physics without any mass. Run ``python examples/plot_nominal_dynamics.py --help``
+for options.
 """
 
 # %%
@@ -45,8 +46,8 @@ quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 sizes, n_inducing = ((5, 10), 15) if quick else ((10, 20, 40, 80, 160), 50)
 
 # %%
-# Data: moves of the arm, and a wrong model of it
-# -----------------------------------------------
+# Simulate moves of the arm
+# -------------------------
 
 try:
     import matplotlib.pyplot as plt
@@ -62,11 +63,11 @@ except ValueError as error:
 n_joints = train.target.shape[1] // 2
 
 # %%
-# Two priors, and more and more data
-# ----------------------------------
-# ``tol=10``: L-BFGS stops when an iteration no longer gains 10 nats, of a bound of some hundred thousand. The default
-# takes several times as long for errors that are hardly smaller. ``groups``: the rows of a move are alike, and are not
-# as many facts as they are rows. Noise and signal are therefore set by what is predicted of moves that were left out.
+# Fit both models to more and more data
+# -------------------------------------
+# With ``tol=10``, L-BFGS stops when an iteration gains less than 10 nats, of some hundred thousand. The default takes
+# several times as long, for slightly smaller errors. Rows of a move are alike, so ``groups`` identifies the moves.
+# Held-out moves then determine noise and signal.
 
 names = "IFG", "IF + nominal"
 features = InertiaForceGravity("iiwa14"), make_union(InertiaForce("iiwa14"), NominalDynamics(wrong))
@@ -98,7 +99,7 @@ for size in sizes:
         )
 
 # %%
-# What the wrong model knows without data: Euler's rule with its accelerations, the prior mean of the second model.
+# The prior mean of the second model needs no data. It is Euler's rule with the accelerations of the wrong model.
 
 nominal = models["IF + nominal"]
 untrained = nominal.feature_map_.transform(test.data) @ nominal.coef_prior_mean_.T
@@ -109,9 +110,9 @@ print(f"the wrong model without data: Error {untrained_error:.5f}")
 print("weights of the nominal accelerations, as multiples of Δt:", *(f"{weight:.2f}" for weight in weights / test.dt))
 
 # %%
-# Pictures
-# --------
-# The weights stay within about 20 % of Δt.
+# Plot errors and weights
+# -----------------------
+# The weights remain within about 20 % of Δt.
 
 colours = dict(zip(names, ("C1", "C0"), strict=True))
 figure, axes = plt.subplots(2, 2, figsize=(8, 6.2))

@@ -1,11 +1,11 @@
 """
-A mass changes, and the model follows
-=====================================
+Follow a system that changes
+============================
 
-A model of the cartpole is learned from simulated seconds, and then used: at each step it predicts the next state, and
-is told what came of it. After a while somebody hangs a weight on the pole. A model that is left as it was goes on
-predicting the old system; one that folds each row in, exactly and in milliseconds, averages the two; and one that lets
-the past fade (``forgetting_factor``) follows. Run ``python examples/plot_online.py --help`` for options.
+A model of the cartpole is learned from simulated seconds. Then it predicts the next state at each step, and gets the
+true state afterwards. After a while, a weight is added to the pole. A model without updates continues to predict the
+old system. A model with ``partial_fit`` averages both systems. A model with a ``forgetting_factor`` follows the new
+one. Each update takes milliseconds. Run ``python examples/plot_online.py --help`` for options.
 """
 
 # %%
@@ -46,9 +46,9 @@ quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 n_steps, change = (60, 30) if quick else (400, 200)
 
 # %%
-# What is learned before, and what happens then
-# ---------------------------------------------
-# The forces are random, and states are measured with noise.
+# Simulate the cartpole before and after the change
+# -------------------------------------------------
+# Forces are random, and the measured states have noise.
 
 try:
     import matplotlib.pyplot as plt
@@ -67,9 +67,9 @@ deviation = options.noise * train.target.std(axis=0)
 measured = states + deviation * rng.standard_normal(states.shape)
 
 # %%
-# Three ways to go on
-# -------------------
-# ``compile`` makes a predictor without validation, which takes on the new weights after each ``partial_fit``.
+# Run three models online
+# -----------------------
+# ``compile`` makes a predictor without validation. ``update`` gives it the new weights after each ``partial_fit``.
 
 model = EVGPRegressor(
     InertiaForceGravity("cartpole"),
@@ -106,9 +106,9 @@ for name, factor in ways.items():
     print(f"{name:34s} median error over the noise: before, after {medians}{cost}", flush=True)
 
 # %%
-# Errors over time
-# ----------------
-# In units of the noise of each state; the mean over the last second.
+# Plot errors over time
+# ---------------------
+# Errors are in units of the noise of each state, averaged over the last second.
 
 figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True)
 colours = ("#D55E00", "#999999", "#0072B2")

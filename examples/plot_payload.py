@@ -1,19 +1,21 @@
 """
-What does the arm carry?
-========================
+Estimate the payload of an arm
+==============================
 
-A robot that knows its own torques knows by them what hangs on it. First the body's mass and centre of mass are found
-from a log with it and one without (``InverseDynamics.estimate_payload``), with intervals that shrink as data come in.
-Then online: the arm picks the body up while it moves, and an ``EVGPRegressor`` whose torques share one set of weights
-follows by ``partial_fit``. Give the folder of a real arm's logs, ``python examples/plot_payload.py DATA_DIR``, or none:
-then an arm is simulated. Run ``python examples/plot_payload.py --help`` for options.
+The torques of a robot depend on the body that it carries. First, ``InverseDynamics.estimate_payload`` finds the mass
+and the centre of mass of the body, from a log with it and a log without it. Intervals shrink with more data. The second
+part works online: the arm picks up the body while it moves. An ``EVGPRegressor`` whose torques share one set of weights
+follows by ``partial_fit``.
+
+Pass the folder of a real arm's logs, ``python examples/plot_payload.py DATA_DIR``. Without a folder, an arm is
+simulated. Run ``python examples/plot_payload.py --help`` for options.
 """
 
 # %%
 # Options
 # -------
-# A real arm's folder holds a URDF file and tables, by the names below and without a header: time, six positions, six
-# velocities, six currents (further columns are passed over).
+# The folder of a real arm has a URDF file and tables with the names below, without a header. The columns are time, six
+# positions, six velocities and six currents. Further columns are ignored.
 
 import argparse
 import os
@@ -54,13 +56,14 @@ duration = 8.0 if quick else 30.0
 scratch = tempfile.TemporaryDirectory()
 
 # %%
-# Logs without and with the load
-# ------------------------------
-# The simulated arm is a UR10 of which the model has masses, centres of mass and inertias wrong by up to 20 %; its
-# motors give some 5 % less torque than the catalogue says. A third log is of an arm that picks the body up half-way.
-# The gears' friction grows with the load, as in harmonic drives, which no weight stands for: where gains are right,
-# intervals of 95 % held the mass and the centre of mass 12 times of 16 in four such pairs of 20 s (``gain_scale=0``),
-# and 24 times of 24 in six pairs whose friction did not grow.
+# Read logs with and without the load
+# -----------------------------------
+# The simulated arm is a UR10. Masses, centres of mass and inertias of its model are wrong by up to 20 %. Its motors
+# give about 5 % less torque than the catalogue says. In a third log, the arm picks up the body half-way. The friction
+# of the gears grows with the load, as in harmonic drives, and no weight of the model describes that.
+#
+# With right gains (``gain_scale=0``), 95 % intervals contained mass and centre of mass 12 times of 16, in four such
+# pairs of 20 s. In six pairs whose friction did not grow, they did 24 times of 24.
 
 try:
     import matplotlib.pyplot as plt
@@ -90,12 +93,12 @@ except (ValueError, OSError) as error:
 scratch.cleanup()
 
 # %%
-# The load as data come in
-# ------------------------
-# If the gains are trusted (``gain_scale=0``), an error of them is an error of the mass, and the interval does not know:
-# motors that give 5 % less than the catalogue says carry a load that seems 5 % too heavy. With ``gain_scale=0.1`` each
-# gain is unknown up to some 10 %, and the interval says what that leaves of the mass. (Only weights are asked for,
-# which need no Gaussian process: ``n_inducing=0``.)
+# Estimate the load from more and more data
+# -----------------------------------------
+# With ``gain_scale=0``, an error of the gains becomes an error of the mass, and the interval does not include it. If
+# motors give 5 % less than the catalogue, the load seems 5 % too heavy. With ``gain_scale=0.1``, each gain is uncertain
+# by about 10 %, and the interval of the mass includes that. ``n_inducing=0`` leaves out the Gaussian process, because
+# only weights are needed.
 
 lengths = np.linspace(2.0, loaded.time[-1] - loaded.time[0], 2 if quick else 9)
 models, found = {}, {}
@@ -115,14 +118,15 @@ for gain_scale in (0.0, 0.1):
 print(f"{'truth':32s}{mass:9.3f}{'' if com is None else f'           {1e3 * np.array(com)}'}")
 
 # %%
-# Online: the weights follow
-# --------------------------
-# What was learned of the arm is the prior; the last link may now have any ten parameters that a body of some kg would
-# add. Ten rows a second are folded in, in batches of half a second, each exactly and in milliseconds. At each batch the
-# past counts by the forgetting factor less: with 0.8 the last 2.5 s matter. The Gaussian process sees velocities only:
-# what positions explain it would take from the load. It knows no gains, so that a load seems some 5 % too heavy, as
-# above. Bands are those of a mass that does not change: just after it did, while rows from before still count, they are
-# too narrow.
+# Estimate the load online
+# ------------------------
+# The posterior of the arm is the prior. The last link may get any ten parameters that a body of some kg would add. Each
+# batch has five rows of half a second. ``partial_fit`` adds it exactly and in milliseconds. At each batch, the past is
+# multiplied by the forgetting factor. With 0.8, the last 2.5 s matter. The Gaussian process has velocities as inputs
+# only. With positions, it would explain part of the load.
+#
+# The gains are not estimated here, so the load seems about 5 % too heavy, as above. The intervals assume a constant
+# mass. Just after a change they are too narrow, while old rows still count.
 
 
 def velocities(X):
@@ -148,7 +152,7 @@ if online is not None:
             random_state=options.seed,
         )
         with warnings.catch_warnings():
-            # The weights are what is wanted: not the last nat, nor bands for torques.
+            # Only the weights are needed, so the tolerance is large.
             warnings.simplefilter("ignore", ConvergenceWarning)
             warnings.simplefilter("ignore", DependentRowsWarning)
             follower.fit(unloaded.data[::10], unloaded.target[::10])
@@ -161,8 +165,8 @@ if online is not None:
         print(f"online, forgetting factor {factor:g}: mass of the load from {ends} kg")
 
 # %%
-# Mass and centre of mass against seconds of log
-# ----------------------------------------------
+# Plot mass and centre of mass
+# ----------------------------
 
 figure, axes = plt.subplots(2 if online is None else 3, 1, figsize=(8, 5 if online is None else 7.2))
 colours = ("#D55E00", "#0072B2", "#009E73")

@@ -1,19 +1,20 @@
 """
-Torques of a real arm from its logs
-===================================
+Learn torques of a real arm from its logs
+=========================================
 
-A robot on a table gives a log of positions, velocities and motor currents, and its maker a URDF file whose masses are
-rough and whose gears have no friction. From both, ``InverseDynamics`` learns the torques with bands, and finds masses
-and friction with intervals. Here they are compared with those of the URDF and of least squares, on a trajectory that
-none of them has seen. Give the folder of a real arm's logs, ``python examples/plot_real_arm.py DATA_DIR``, or none:
-then an arm is simulated. Run ``python examples/plot_real_arm.py --help`` for options.
+A robot's log has positions, velocities and motor currents. The URDF file of its maker has rough masses and no friction.
+From both, ``InverseDynamics`` learns the torques with standard deviations, and finds masses and friction with
+intervals. Here it is compared with the URDF alone and with least squares, on a new trajectory.
+
+Pass the folder of a real arm's logs, ``python examples/plot_real_arm.py DATA_DIR``. Without a folder, an arm is
+simulated. Run ``python examples/plot_real_arm.py --help`` for options.
 """
 
 # %%
 # Options
 # -------
-# A real arm's folder holds a URDF file and tables, by the names below and without a header: time, six positions, six
-# velocities, six currents (further columns are passed over).
+# The folder of a real arm has a URDF file and tables with the names below, without a header. The columns are time, six
+# positions, six velocities and six currents. Further columns are ignored.
 
 import argparse
 import os
@@ -49,11 +50,11 @@ settings = {"n_inducing": 10, "max_rows": 300, "max_iter": 15} if quick else {}
 scratch = tempfile.TemporaryDirectory()
 
 # %%
-# The robot as its maker describes it, and the logs
-# -------------------------------------------------
-# The simulated arm is a UR10 whose masses, centres of mass and inertias the model has wrong by up to 20 %. Its gears
-# have viscous friction, and Coulomb's, which grows with the load; its currents have noise of 2 %, and its motors give
-# some 5 % less than the catalogue says. Only its log reaches what follows.
+# Read the URDF and the logs
+# --------------------------
+# The simulated arm is a UR10. Masses, centres of mass and inertias of its model are wrong by up to 20 %. Its gears have
+# viscous friction, and Coulomb friction that grows with the load. Currents have 2 % noise, and motors give about 5 %
+# less torque than the catalogue says. The models below get the log only.
 
 try:
     import matplotlib.pyplot as plt
@@ -84,10 +85,10 @@ scratch.cleanup()
 print(f"{robot.name}, {'simulated' if truth else 'its logs'}: {len(train.data)} rows of {len(TRAINING)} trajectories")
 
 # %%
-# What was done to the signals
-# ----------------------------
-# They are interpolated to a grid of 10 ms and filtered at 5 Hz, forth and back so that nothing is late, and
-# accelerations are differences of the filtered velocities.
+# Plot the processed signals
+# --------------------------
+# Signals are interpolated to a grid of 10 ms and filtered at 5 Hz, forwards and backwards, so that there is no delay.
+# Accelerations are differences of the filtered velocities.
 
 options.output.mkdir(parents=True, exist_ok=True)
 stem = "real_arm" if options.data is None else "real_arm_measured"
@@ -95,11 +96,11 @@ shown = [1, 2, 4]
 SignalsDisplay.from_log(train, joints=shown).figure_.savefig(options.output / f"{stem}_signals.png")
 
 # %%
-# Three ways to predict torques
+# Predict torques in three ways
 # -----------------------------
-# The first two need the same features: the torque is linear in masses, first moments, inertias and friction.
-# ``gain_scale`` says that the gains of a catalogue may be off by some 10 %. Rows of a log depend on each other:
-# ``groups``, the files, tell what holds for another trajectory.
+# The first two models have the same features: the torque is linear in masses, first moments, inertias and friction.
+# ``gain_scale`` allows gains to differ from the catalogue by about 10 %. Rows of a log depend on each other, so
+# ``groups`` identifies the files.
 
 body = RigidBodyRegressor(robot)
 features, features_new = body.fit_transform(train.data), body.transform(new.data)
@@ -120,13 +121,13 @@ inside = (np.abs(new.target - mean) < 2.0 * std).mean(axis=0)
 print(f"{'within 2 std':16s}", *(f"{value:13.3f}" for value in inside))
 
 # %%
-# What the arm is made of
-# -----------------------
-# Torques do not show everything: not the mass of a link that turns about the vertical, nor how a mass is shared by two
-# links. There the interval stays as wide as that of the prior, around the URDF's value. What they do show, a user can
-# ask for: any linear function of the weights has its own interval, such as the torque that holds the arm stretched
-# out. (The simulated gears' friction grows with the load, so that it has no true values; and it is found in the units
-# of what was measured, with the catalogue's gains.)
+# Look at masses and friction
+# ---------------------------
+# Torques do not determine all masses. Examples are the mass of a link that turns about the vertical, and how two links
+# share a mass. For these, the interval is that of the prior, around the value of the URDF. Any linear function of the
+# weights has an interval, such as the torque that holds the stretched arm. The friction of the simulated gears grows
+# with the load, so it has no single true value. It is in the units of the measured torques, with the gains of the
+# catalogue.
 
 n_inertial = 10 * len(joints)
 holding = body.transform(np.zeros((1, 3 * len(joints))))[0]
@@ -141,7 +142,7 @@ prior_cov = body.coef_prior(len(joints))[1]
 
 
 def interval(row, mean, covariance):
-    """Mean, and half of the width of the interval that holds 95 %, of row @ weights."""
+    """Return the mean of row @ weights, and half the width of its 95 % interval."""
     return np.array([row @ mean, 1.96 * np.sqrt(row @ covariance @ row)])
 
 
@@ -152,10 +153,10 @@ for name, row in asked.items():
     print(f"{name:46s}{units[name[0]]:7s}{before[0]:8.2f} ± {before[1]:6.2f}{after[0]:10.3f} ± {after[1]:6.3f}{known}")
 
 # %%
-# Torques, errors and parameters
-# ------------------------------
-# The URDF alone knows gravity, but nothing of friction. The band is that of InverseDynamics, two standard deviations to
-# each side of its mean.
+# Plot torques, errors and parameters
+# -----------------------------------
+# The URDF alone has gravity, but no friction. The interval is two standard deviations of InverseDynamics on each side
+# of its mean.
 
 figure, axes = plt.subplots(3, 2, figsize=(8, 6.8), width_ratios=(1.3, 1))
 colours = {"URDF": "#D55E00", "least squares": "#999999", "InverseDynamics": "#0072B2"}

@@ -1,11 +1,10 @@
 """
-See a hundred steps ahead
-=========================
+Predict a hundred steps
+=======================
 
-Models learn one step of 0.03 s of a pendulum, a cartpole and an acrobot. Applied to their own predictions they see
-three seconds ahead, and ``rollout`` says how surely: each particle follows one function drawn from the posterior, so
-that what is not known of the system is the same at each step. States and inputs were not in the data. Run
-``python examples/plot_rollout.py --help`` for options.
+Models learn one step of 0.03 s of a pendulum, a cartpole and an acrobot. ``rollout`` applies them to their own
+predictions, for three seconds. Each particle follows one function from the posterior, because the error of the model is
+the same at each step. The test states and inputs are new. Run ``python examples/plot_rollout.py --help`` for options.
 """
 
 # %%
@@ -26,7 +25,7 @@ from skevgp.features import AngleEncoder, InertiaForceGravity
 from skevgp.plotting import RolloutDisplay
 from skevgp.solvers import LBFGS
 
-# Inducing points, trajectories of 3 s to learn from, and the position that is drawn.
+# Number of inducing points, number of training trajectories of 3 s, and index of the plotted position.
 SYSTEMS = {
     "pendulum": (10, 5, 0, "angle (rad)"),
     "cartpole": (40, 6, 1, "angle of the pole (rad)"),
@@ -46,10 +45,10 @@ quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 n_test, n_particles, n_steps, tol = (4, 20, 30, 1e3) if quick else (20, 100, 100, 10.0)
 
 # %%
-# Learn one step, predict many
-# ----------------------------
-# The kernel sees sines and cosines of the angles, which go round. All initial states go into one call of ``rollout``.
-# Of true states 95 % should be within two standard deviations of the particles' mean.
+# Learn one step and predict many
+# -------------------------------
+# The kernel has sines and cosines of the angles as inputs, because angles are periodic. One call of ``rollout``
+# predicts from all initial states. 95 % of the true states should be within two standard deviations of the mean.
 
 horizons = np.array([1, n_steps // 10, n_steps // 2, n_steps])
 rollouts, truths, coverage = {}, {}, {}
@@ -90,10 +89,11 @@ except ValueError as error:
     sys.exit(f"error: {error}")
 
 # %%
-# Truth, samples and bands; errors, and what the bands promise
-# ------------------------------------------------------------
-# Above, of each system, a test trajectory: the one of which the particles are least sure at the end. Below, medians
-# over all of them: errors grow hundreds of times within a second, and the particles' standard deviations with them.
+# Plot trajectories and errors
+# ----------------------------
+# The upper row shows a test trajectory of each system, the one with the largest standard deviation at the end. The
+# lower row shows medians over all trajectories. Errors grow hundreds of times within a second, and so do the standard
+# deviations.
 
 figure, axes = plt.subplots(2, len(SYSTEMS), figsize=(8, 5.1), sharex=True)
 times = train.dt * np.arange(1, n_steps + 1)

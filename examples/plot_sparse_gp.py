@@ -2,14 +2,14 @@
 A sparse Gaussian process in scikit-learn
 =========================================
 
-`GaussianProcessRegressor` needs a matrix of all rows against all rows: a few thousand rows are the end of it.
-`EVGPRegressor` looks at the same data through a handful of *inducing points*. Here both learn a wave on a linear
-trend. The trend is an explicit feature, so that the model still knows it where the data end.
+`GaussianProcessRegressor` needs a matrix of all rows against all rows, so it works for a few thousand rows only.
+`EVGPRegressor` represents the same data by a few *inducing points*. Here both learn a wave on a linear trend. The trend
+is an explicit feature, so the model continues it beyond the data.
 """
 
 # %%
-# Data: 1,000 points of a wave on a line of slope 3
-# -------------------------------------------------
+# Simulate a wave on a line of slope 3
+# ------------------------------------
 
 import os
 import sys
@@ -30,8 +30,8 @@ X, y = make_toy(200 if quick else 1000, random_state=0, return_X_y=True)
 x_grid = np.linspace(-3.0, 9.0, 400)[:, np.newaxis]
 
 # %%
-# The exact GP of scikit-learn
-# ----------------------------
+# Fit scikit-learn's exact Gaussian process
+# -----------------------------------------
 
 start = time.perf_counter()
 kernel = ConstantKernel(10.0) * RBF(1.0) + WhiteKernel(1.0)
@@ -40,9 +40,9 @@ exact_seconds = time.perf_counter() - start
 exact_mean, exact_std = exact.predict(x_grid, return_std=True)
 
 # %%
-# The sparse GP with an explicit trend
-# ------------------------------------
-# ``PolynomialFeatures(1)`` is h(x) = (1, x); twenty inducing points are enough for the wave.
+# Fit a sparse Gaussian process with an explicit trend
+# ----------------------------------------------------
+# ``PolynomialFeatures(1)`` is h(x) = (1, x). Twenty inducing points are enough for the wave.
 
 start = time.perf_counter()
 sparse = EVGPRegressor(PolynomialFeatures(1), n_inducing=20, random_state=0).fit(X, y)
@@ -61,8 +61,8 @@ print(
 )
 
 # %%
-# The same picture inside the data; outside, one falls back to a constant, the other to the trend
-# ------------------------------------------------------------------------------------------------
+# Compare both inside and outside the data
+# ----------------------------------------
 
 figure, axes = plt.subplots(1, 2, figsize=(8, 3.1), sharey=True)
 for ax, title, mean, std in (

@@ -2,12 +2,13 @@
 Swing a pole up with a model learned from seconds of data
 =========================================================
 
-A cart on a rail shall swing its pole up and balance it, and nothing is known of masses and lengths. A model of the
-system's next state is learned from seconds of random moves, once with rough physics (EVGP-IFG: inertia, force and the
-sine of gravity as features) and once without. Then iLQR plans with it, anew at each step: it needs predictions and
-their Jacobians along a plan, of which ``compile()`` gives thousands a second. The planner is in ``mpc.py`` beside this
-file; the plant is simulated by Pinocchio. Run ``python examples/plot_swing_up.py --system pendulum`` for a pendulum
-whose motor is too weak to lift it in one go, and ``--help`` for options.
+A cart on a rail swings up its pole and balances it, without known masses and lengths. Models of the next state are
+learned from seconds of random moves. One has rough physics (EVGP-IFG: inertia, force and the sine of gravity as
+features), the other has none. Then iLQR plans again at each step. It needs predictions and their Jacobians along a
+plan, and ``compile()`` computes thousands of them per second.
+
+The planner is in ``mpc.py`` next to this file, and Pinocchio simulates the system. Run ``python
+examples/plot_swing_up.py --system pendulum`` for a pendulum with a weak motor, and ``--help`` for options.
 """
 
 # %%
@@ -49,11 +50,11 @@ if os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1":
 seconds = SECONDS[task.system] if options.seconds is None else options.seconds
 
 # %%
-# Learn, and swing up
-# -------------------
-# Data are short trajectories from random states, with random inputs. The planner never sees the system's equations; it
-# starts at rest, the pole hanging, and may push with 100 N (the pendulum's motor: with 2 N m, where 4.9 would hold it
-# level).
+# Learn and swing up
+# ------------------
+# Data are short trajectories from random states with random inputs. The planner does not know the equations of the
+# system. It starts at rest with a hanging pole. The limit of the force is 100 N. The motor of the pendulum has 2 N m,
+# and 4.9 N m would hold it level.
 
 try:
     import matplotlib.pyplot as plt
@@ -81,10 +82,10 @@ except ValueError as error:
     sys.exit(f"error: {error}")
 
 # %%
-# The swing-up in a strip of frames, what was planned, and what the models knew
-# -----------------------------------------------------------------------------
-# Each plan starts at a true state: where thin lines leave the thick one, the model was wrong, or the plan was changed.
-# (On which side the pole comes up is chance.) One step ahead, errors should mostly stay below two standard deviations.
+# Plot the swing-up, the plans and the errors
+# -------------------------------------------
+# Each plan starts at a true state. If a thin line leaves the thick one, the model was wrong or the plan changed. The
+# side on which the pole comes up is random. One step ahead, most errors should be below two standard deviations.
 
 colours = {"EVGP-IFG": "#0072B2", "without physics": "#D55E00"}
 has_cart = task.system == "cartpole"
@@ -92,7 +93,7 @@ push = "force (N)" if has_cart else "torque (N m)"
 
 
 def draw(ax, state, u, center):
-    """The system at a state, around a place on the page."""
+    """Draw the system in a state, around a position on the page."""
     x = state[0] if has_cart else 0.0
     pole = state[task.pole]
     # The cartpole's axis points at us, the pendulum's away from us.

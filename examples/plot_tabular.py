@@ -1,12 +1,12 @@
 """
-Tables of numbers, beside scikit-learn's own regressors
-=======================================================
+Compare with scikit-learn's regressors on tables
+================================================
 
-A Gaussian process says how sure it is of each row, and learns smooth functions from few of them. Trees learn jumps, and
-any number of rows. Here `EVGPRegressor` stands beside scikit-learn's exact `GaussianProcessRegressor`, beside
-`HistGradientBoostingRegressor` with quantiles, and beside `BayesianRidge`: on the diabetes data, on Friedman's three
-functions, and on made houses, of which it is the trees that like them. Run ``python examples/plot_tabular.py --help``
-for options; ``benchmarks/tables.py`` has more rows, sets and seeds.
+A Gaussian process predicts a standard deviation for each row, and learns smooth functions from few rows. Trees learn
+jumps, from any number of rows. This example compares `EVGPRegressor` with the exact `GaussianProcessRegressor`,
+`HistGradientBoostingRegressor` with quantiles, and `BayesianRidge`. The data are scikit-learn's diabetes data,
+Friedman's three functions, and simulated house prices, on which trees are better. Run ``python examples/plot_tabular.py
+--help`` for options. ``benchmarks/tables.py`` has more data sets and seeds.
 """
 
 # %%
@@ -51,10 +51,10 @@ quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 n_rows, n_test = (80, 200) if quick else (options.rows, 1000)
 
 # %%
-# Data
-# ----
-# The noise of Friedman's functions is what he gave them (1991). Houses are like California's, which would have to be
-# downloaded: the price jumps where a district begins, and columns are skewed.
+# Make the data
+# -------------
+# Friedman's functions have the noise of his paper (1991). The houses are like California's, but need no download.
+# Prices jump at the borders of districts, and columns are skewed.
 
 
 def make_houses(n_samples, random_state):
@@ -78,10 +78,10 @@ sets = {
 }
 
 # %%
-# Models
-# ------
-# All with their defaults. Trees have no standard deviation: here it is that of the normal distribution with the
-# quantiles of 5 % and 95 % that two further fits predict.
+# Define the models
+# -----------------
+# All models have their defaults. Trees have no standard deviation. Two more fits predict the quantiles of 5 % and 95 %,
+# and the standard deviation is that of the normal distribution with these quantiles.
 
 try:
     import matplotlib.pyplot as plt
@@ -122,10 +122,10 @@ def models(n_columns):
 
 
 # %%
-# Errors, densities, intervals and time
-# -------------------------------------
-# NLPD is minus the log density of what was observed, in nats per row and of y with variance one: lower is better, and
-# what is far off and sure of itself costs most. Nine of ten values should be within the 90 % interval.
+# Measure errors, densities, intervals and time
+# ---------------------------------------------
+# NLPD is minus the log density of the test values, in nats per row, for y with variance one. Lower is better. Large
+# errors with a small standard deviation cost most. Nine of ten values should be within the 90 % interval.
 
 results, fitted, tests = {}, {}, {}
 print(f"{'':12s} {'':26s} {'RMSE':>7s} {'NLPD':>7s} {'within 90 %':>12s} {'seconds':>8s}")
@@ -152,17 +152,17 @@ for name, (X, y) in sets.items():
         print(f"{name:12s} {label:26s} {row[0]:7.3f} {row[1]:7.2f} {row[2]:12.3f} {row[3]:8.2f}")
 
 # %%
-# What was learned
-# ----------------
-# Five of the ten columns of Friedman's first function do nothing. Their lengthscales say so.
+# Look at the length scales
+# -------------------------
+# Five of the ten columns of Friedman's first function are irrelevant. Their length scales are large.
 
 print(fitted["friedman1", "EVGPRegressor"][-1].summary())
 
 # %%
-# Who promises what
-# -----------------
-# Left: how often values of the houses lie inside of intervals. Beside it error and density, and how far they are from
-# the best of each set.
+# Plot coverage and scores
+# ------------------------
+# The left panel shows the coverage of intervals for the houses. The others show error and density, relative to the best
+# model for each data set.
 
 figure, axes = plt.subplots(1, 3, figsize=(8, 3.4))
 labels = list(models(1))

@@ -1,16 +1,17 @@
 """
-An arm that carries what nobody told it
-=======================================
+Track references with a learned torque model
+============================================
 
-An iiwa14 tracks references by computed torque. Its model knows nothing of the load in its hand, nor of the friction in
-its joints, and it is off by what these cost. ``InverseDynamics`` learns the torques from a minute of the arm's own log:
-masses and friction that all joints share, with the model as prior, and a Gaussian process of what gears do beside it.
-The reference is known ahead, so that its torques are predicted in one batch, and the controller adds them.
+An iiwa14 tracks references by computed torque. Its model has no load and no friction, so it makes errors.
+``InverseDynamics`` learns the torques from a minute of the arm's own log. All joints share masses and friction, with
+the nominal model as prior, and a Gaussian process learns the residual. The reference is known in advance, so one batch
+predicts all torques, and the controller adds them.
 
-Predictions know how good they are. Moves are made as fast as torque limits allow: if only the mean stays within them,
-most moves break them; if the mean plus k standard deviations does, the limits hold, and moves take a little longer. The
-plant is simulated, with Pinocchio's dynamics, in ``computed_torque.py`` beside this file. Run
-``python examples/plot_tracking.py --help`` for options.
+The standard deviations of the torques are useful too. Moves are made as fast as torque limits allow. If only the mean
+is below the limits, most moves exceed them. If the mean plus k standard deviations is below the limits, they hold, and
+moves take slightly longer.
+
+``computed_torque.py`` next to this file simulates the arm. Run ``python examples/plot_tracking.py --help`` for options.
 """
 
 # %%
@@ -46,8 +47,8 @@ n_runs, seconds, n_inducing, n_moves = (3, 4.0, 10, 20) if quick else (6, 10.0, 
 # %%
 # Learn from the log
 # ------------------
-# The arm moves along some waves, badly, and joints measure torques. The prior is the nominal model with a load that may
-# weigh a few kg.
+# The arm moves along some waves, inaccurately, and sensors measure the torques. The prior is the nominal model with a
+# load of unknown mass, up to a few kg.
 
 try:
     import matplotlib.pyplot as plt
@@ -65,24 +66,25 @@ X, y, groups = arms.log_of(log)
 model = arms.learner(n_inducing=n_inducing, max_rows=1500, random_state=options.seed).fit(X, y, groups=groups)
 
 # %%
-# Track what was not in the log
-# -----------------------------
+# Track new references
+# --------------------
 
 reference = arms.waves(1, 4.0 if quick else 8.0, options.seed + 2)
 feedforward = arms.missed_by(nominal, model, reference)
 runs = {
     "nominal model": arms.track(arm, ComputedTorque(nominal, reference), options.seed),
-    "with what was learned": arms.track(arm, ComputedTorque(nominal, reference, feedforward), options.seed),
+    "with the learned torques": arms.track(arm, ComputedTorque(nominal, reference, feedforward), options.seed),
 }
 errors = {name: 1e3 * np.sqrt(np.mean(run.error**2)) for name, run in runs.items()}
 for name, error in errors.items():
     print(f"{name:22s} rms error of joints {error:6.2f} mrad")
 
 # %%
-# As fast as limits allow
-# -----------------------
-# By Boole's inequality the chance that a move breaks a limit is no more than the sum over joints and steps. That is
-# cautious, and leaves room for accelerations that were not in the log, where models are less sure than they say.
+# Move as fast as the limits allow
+# --------------------------------
+# By Boole's inequality, the probability that a move exceeds a limit is at most the sum over joints and steps. This is
+# cautious. The margin helps with accelerations that were not in the log, where standard deviations of the model are too
+# small.
 
 limits = options.limit * arm.effort
 n_joints = len(limits)
@@ -103,9 +105,9 @@ for width, (durations, _) in planned.items():
     print(f"mean + {width:3.1f} std: {broken:4.0%} of {len(starts)} moves break a limit, {durations.mean():.2f} s each")
 
 # %%
-# What happened
-# -------------
-# Bands are wide where joints stand still: friction may then be anything up to Coulomb's.
+# Plot the results
+# ----------------
+# Intervals are wide where joints stand still, because friction may have any value up to Coulomb's.
 
 blue, orange, grey = "#0072B2", "#D55E00", "0.35"
 colours = dict(zip(runs, (orange, blue), strict=True))
@@ -114,7 +116,7 @@ data = nominal.model.createData()
 
 
 def tip(q):
-    """Where the last joint is, m."""
+    """Return the position of the last joint, m."""
     places = []
     for row in q:
         pin.forwardKinematics(nominal.model, data, row)
@@ -135,7 +137,7 @@ axes[0, 0].set(title="The hand, seen from the front", xlabel="y (m)", ylabel="z 
 axes[0, 1].set(title="How far the hand is off", xlabel="time (s)", ylabel="mm", yscale="log", ylim=(0.02, 200.0))
 
 joint = 3
-run = runs["with what was learned"]
+run = runs["with the learned torques"]
 mean, std = (part[:, joint] for part in model.predict(run.motion[:, 0], return_std=True))
 believed = nominal.forces(*np.split(run.motion[:, 0], 3, axis=1))[:, joint]
 ax = axes[2, 0]
@@ -146,7 +148,7 @@ ax.fill_between(times, mean - 2 * std, mean + 2 * std, color=blue, alpha=0.3, li
 ax.set_xlim(0.5, 3.5)
 ax.set(title=f"Torque of joint {joint + 1} on the way", xlabel="time (s)", ylabel="N m")
 
-# Without caution, of the moves that break a limit one in the middle; at the joint, step and side where it does.
+# Without caution: the median of the moves that exceed a limit, at the joint, step and side where it does.
 by_peak = np.argsort(tried[0.0][3])
 move = by_peak[(np.searchsorted(tried[0.0][3][by_peak], 1.0) + len(by_peak)) // 2]
 over = np.abs(tried[0.0][2][:, move]) / limits

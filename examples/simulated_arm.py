@@ -2,16 +2,16 @@
 Logs of a simulated arm
 =======================
 
-For the examples that learn from a robot's logs, without a robot: an arm of the package example-robot-data moves along
-sums of sines, its gears have Coulomb's and viscous friction (the former grows with the load, as in harmonic drives),
-and what a robot's controller would write down goes into a file: irregular times, positions, velocities, currents.
+This module simulates logs for the examples that need a real robot. An arm of the package example-robot-data moves along
+sums of sines. Its gears have viscous friction, and Coulomb friction that grows with the load, as in harmonic drives. A
+file gets the signals that a robot's controller would record: irregular times, positions, velocities and currents.
 """
 
 import numpy as np
 import pinocchio
 
 CATALOGUE_GAINS = np.array([14.0, 14.0, 12.0, 10.0, 10.0, 10.0])  # torque per current, N m/A
-GAINS = CATALOGUE_GAINS * [0.95, 0.94, 0.96, 0.93, 0.97, 0.95]  # what the motors really have
+GAINS = CATALOGUE_GAINS * [0.95, 0.94, 0.96, 0.93, 0.97, 0.95]  # the true gains
 HOME = np.array([0.0, -1.6, 0.4, -1.6, 0.3, 0.0])  # an arm that stands upright with a bent elbow, rad
 VISCOUS = np.array([12.0, 12.0, 8.0, 3.0, 3.0, 2.0])  # N m s/rad
 COULOMB = np.array([8.0, 8.0, 5.0, 2.0, 2.0, 1.5])  # N m
@@ -20,7 +20,7 @@ STICTION_VELOCITY = 0.02  # rad/s
 
 
 def sums_of_sines(times, rng, speed=0.2):
-    """Positions, velocities and accelerations of six joints along harmonics of 0.1 Hz up to 0.8 Hz."""
+    """Return positions, velocities and accelerations of six joints. Harmonics of 0.1 Hz go up to 0.8 Hz."""
     omega = 2.0 * np.pi * 0.1 * np.arange(1, 9)
     amplitude = speed * rng.standard_normal((6, 8)) / omega
     phase = omega * times[:, np.newaxis, np.newaxis] + rng.uniform(0.0, 2.0 * np.pi, (6, 8))
@@ -30,7 +30,7 @@ def sums_of_sines(times, rng, speed=0.2):
 
 
 def torques(robot, position, velocity, acceleration):
-    """What the motors give: the rigid body's torque and friction."""
+    """Return the torques of the motors: those of the rigid bodies, and friction."""
     data = robot.createData()
     rows = zip(position, velocity, acceleration, strict=True)
     body = np.array([pinocchio.rnea(robot, data, *row) for row in rows])
@@ -41,7 +41,7 @@ def torques(robot, position, velocity, acceleration):
 def write_log(file, robot, seconds, random_state, noise=0.02, loaded=None, change=np.inf):
     """Write a log in the columns time, 6 positions, 6 velocities, 6 currents, about every 8 ms.
 
-    From the second ``change`` on the arm is ``loaded``.
+    After ``change`` seconds, the arm is ``loaded``.
     """
     rng = np.random.RandomState(random_state)
     times = np.arange(0.0, seconds, 0.008)
@@ -57,7 +57,7 @@ def write_log(file, robot, seconds, random_state, noise=0.02, loaded=None, chang
 
 
 def with_payload(robot, mass, com):
-    """A copy of the arm that holds a body (kg, m in the last joint's frame; as large as 5 cm)."""
+    """Return a copy of the arm with a body of 5 cm, from its mass (kg) and place (m) in the last joint's frame."""
     loaded = robot.copy()
     loaded.appendBodyToJoint(
         robot.njoints - 1,

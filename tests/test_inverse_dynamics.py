@@ -12,6 +12,7 @@ from sklearn.preprocessing import StandardScaler
 from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
 from skevgp.features import LogNormal, RigidBodyRegressor
+from skevgp.io import load, save
 from skevgp.robots import RigidBody, inertial_parameters, physical_consistency
 
 
@@ -208,17 +209,49 @@ def test_invalid_input_raises(arm):
     assert not hasattr(model, "coef_")
 
 
-def test_speed_at_which_friction_has_a_sign_is_found_from_several_trajectories():
-    arm = Arm("acrobot", noise=0.01)
-    blurred = np.tanh(arm.X[:, 2:4] / 0.1) - np.tanh(arm.X[:, 2:4] / 0.01)
+def test_velocities_of_friction_lie_in_their_intervals(tmp_path):
+    arm, velocity = Arm("acrobot", noise=0.01), np.array([0.1, 0.03])
+    blurred = np.tanh(arm.X[:, 2:4] / velocity) - np.tanh(arm.X[:, 2:4] / 0.01)
     y = arm.y + arm.coulomb * blurred
 
-    def velocity(groups, **options):
-        return InverseDynamics(arm.nominal, n_inducing=0, **options).fit(arm.X, y, groups=groups).feature_map_
+    def fitted(**options):
+        return InverseDynamics(arm.nominal, n_inducing=0, **options).fit(arm.X, y, groups=arm.groups)
 
-    assert (np.array(velocity(arm.groups).stiction_velocity) > 0.04).all()
-    assert velocity(None).stiction_velocity == 0.01
-    assert velocity(arm.groups, stiction_velocity=None).stiction_velocity == 0.01
+    model = fitted()
+    names = [f"stiction_velocity({joint})" for joint in list(arm.nominal.names)[1:]]
+    assert list(model.theta_) == list(model.theta_std_) == names
+    found, std = (np.array(list(values.values())) for values in (model.theta_, model.theta_std_))
+    assert (np.abs(found - velocity) < 3.0 * std).all()
+    assert (std < 0.3 * velocity).all()
+    # It is the map's up to the last step.
+    assert_allclose(model.feature_map_.stiction_velocity, found, rtol=0.05)
+    friction = dict(zip(model.coef_names_, zip(model.coef_, model.coef_std_, strict=True), strict=True))
+    for joint, coulomb in zip(list(arm.nominal.names)[1:], arm.coulomb, strict=True):
+        mean, own = friction[f"coulomb({joint})"]
+        assert abs(mean - coulomb) < 3.0 * own
+    table = model.summary().to_frame()
+    assert_allclose(table[table["part"] == "parameter"]["std"], std)
+    save(model, tmp_path / "arm.skevgp")
+    loaded = load(tmp_path / "arm.skevgp")
+    assert loaded.theta_ == model.theta_
+    for before, after in zip(model.predict(arm.new, True), loaded.predict(arm.new, True), strict=True):
+        assert_allclose(after, before)
+    given = fitted(stiction_velocity=None)
+    assert given.theta_ == {}
+    assert given.feature_map_.stiction_velocity == 0.01
+
+
+def test_uncertain_velocity_of_friction_widens_std_at_low_speed():
+    arm = Arm("pendulum", noise=0.5, n_groups=1)
+    X = np.array([[0.0, 0.02, 0.0], [0.0, 2.0, 0.0]])
+    std = {
+        velocity: InverseDynamics("pendulum", n_inducing=0, stiction_velocity=velocity)
+        .fit(arm.X, arm.y)
+        .predict(X, True, include_noise=False)[1]
+        for velocity in ("auto", None)
+    }
+    assert std["auto"][0] > 1.2 * std[None][0]
+    assert std["auto"][1] < 1.2 * std[None][1]
 
 
 def test_other_transformers_are_no_robots():

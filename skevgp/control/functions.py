@@ -46,8 +46,8 @@ class Functions:
         return X if self.kernel_map is None else self.kernel_map.value(X), features
 
     def between(self, X: np.ndarray) -> np.ndarray:
-        """Return covariances (n, o, o) between different outputs of a row; 0 unless outputs share weights."""
-        if not self.predictor.shared:
+        """Return covariances (n, o, o) between different outputs of a row; 0 unless outputs share weights or θ."""
+        if not self.predictor.n_common:
             return np.zeros((len(X), len(self.noise), len(self.noise)))
         common = self.predictor.common(*self.mapped(X))
         return np.einsum("kni,knj->nij", common, common) * (1.0 - np.eye(len(self.noise)))
@@ -69,8 +69,8 @@ class Functions:
 
 
 def common_normals(predictor: Predictor, n: int, rng: np.random.RandomState) -> np.ndarray:
-    """Draw the normals (n, 1, p) of weights that all outputs share; p is 0 if they share none."""
-    return rng.standard_normal((n, 1, predictor.offset.shape[1] if predictor.shared else 0))
+    """Draw the normals (n, 1, p) of weights or θ that all outputs share; p is 0 if they share none."""
+    return rng.standard_normal((n, 1, predictor.n_common))
 
 
 def drawn_weights(group: PredictorGroup, n: int, common: np.ndarray, rng: np.random.RandomState) -> np.ndarray:

@@ -111,7 +111,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             Whether to return the standard deviation too.
         return_cov : bool or "joint", default=False
             Whether to return the covariance between rows too, for each output. If ``"joint"``, the covariance between
-            outputs is included. Outputs depend on each other if they share their weights.
+            outputs is included. Outputs depend on each other if they share their weights or parameters of the features.
         include_noise : bool, default=True
             Whether standard deviation and covariance include the learned noise of y. If False, they are those of the
             noise-free g(x).
@@ -305,10 +305,11 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             self.__dict__.pop(name, None)
         maps = replace(data.maps, shapes=problem.shapes)
         self.feature_map_, self.kernel_map_, self._fitted = maps.feature_map, maps.kernel_map, fitted
-        self._theta = None
+        self._theta, found = None, fitted.predictor()
         if calibration is not None:
             self.feature_map_, self._theta = maps.feature_map.feature_map, calibration.posterior
-        self._posterior = Posterior(fitted.predictor(), maps)
+            found = self._theta.predictor(fitted)
+        self._posterior = Posterior(found, maps)
         self._set_weights_and_noise()
         predictor, prior = self._posterior.predictor, fitted.prior
         if self.feature_map_ is not None:

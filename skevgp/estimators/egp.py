@@ -22,7 +22,7 @@ from ..fitting.messages import interrupted
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem
 from ..fitting.start import prior_predictor
-from ..fitting.theta import calibrate
+from ..fitting.theta import calibrate, rough_tol
 from ..noise import Gaussian, as_noise
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
@@ -31,8 +31,6 @@ from .base import GaussianProcess, names_moved_arguments
 
 # Number of rows up to which an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
-# Fits with parameters of the feature map begin with a tolerance of so many nats per row.
-_ROUGH_TOL = 1e-3
 
 
 class EGPRegressor(GaussianProcess):
@@ -257,14 +255,14 @@ class EGPRegressor(GaussianProcess):
             problem = replace(problem, max_iter=0 if self.optimizer is None else self.max_iter)
             rng, vague = check_random_state(self.random_state), problem.vague
 
-            def fit(problem: Problem, previous: ExactFit | None, rough: bool) -> ExactFit:
-                tol = max(self._tolerance(data.source.n_rows), _ROUGH_TOL * data.source.n_rows if rough else 0.0)
+            def fit(problem: Problem, previous: ExactFit | None, rough: bool, about: str) -> ExactFit:
+                tol = max(self._tolerance(data.source.n_rows), rough_tol(problem) if rough else 0.0)
                 optimizer = self.optimizer if callable(self.optimizer) else None
-                return fit_exact(problem, rng, monitor, self.n_restarts, tol, optimizer, previous)
+                return fit_exact(problem, rng, monitor.seen_as(about=about), self.n_restarts, tol, optimizer, previous)
 
             calibration = calibrate(data, problem, fit, rng, monitor)
             if calibration is None:
-                fitted = fit(problem, None, rough=False)
+                fitted = fit(problem, None, False, "")
                 self._set_posterior(data, problem, problem.spec, fitted)
             else:
                 fitted, spec = calibration.fitted, problem.spec
@@ -388,6 +386,7 @@ class EGPRegressor(GaussianProcess):
                 fitted = [np.append(own[:-2], [1.0, own[-1]]) for own in fitted]
         with single_threaded_libraries():
             found = value_at(theta, eval_gradient, order, fitted, self._fitted.log_likelihood_at)
+        found = (found[0] - self._counted_twice, found[1]) if eval_gradient else found - self._counted_twice
         if not clone_kernel:
             kernels, thetas = np.atleast_1d(self.kernel_), np.atleast_2d(np.asarray(theta, dtype=np.float64))
             for kernel, own in zip(kernels, thetas, strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from numbers import Integral
 from typing import Any, ClassVar, Literal, Self
 
@@ -26,13 +25,13 @@ from ..fitting.messages import DEPENDENT_ROWS, interrupted
 from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem, Sharing
-from ..fitting.theta import after_more_rows, calibrate
+from ..fitting.theta import ROUGH_ITER, after_more_rows, calibrate, rough_tol
 from ..noise import as_noise
 from ..noise.base import Noise
 from ..noise.gaussian import input_covariance, relative_noise
 from ..solvers import as_solver
 from ..solvers.base import Solver
-from ..utils.monitor import Monitor, monitor_of
+from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import (
     check_integer,
@@ -44,17 +43,6 @@ from ..utils.validation import (
     words_of,
 )
 from .base import GaussianProcess, names_moved_arguments
-
-# Fits with parameters of the feature map begin with so many iterations, and a tolerance of so many nats per row.
-_ROUGH_ITER, _ROUGH_TOL = 60, 1e-3
-
-
-def _fit_roughly(problem: Problem, previous: Fitted | None, rough: bool, rng: Any, monitor: Monitor) -> Fitted:
-    """Fit a problem, or find out roughly where its kernel and noise are."""
-    if rough:
-        tol = max(problem.tol or 0.0, _ROUGH_TOL * problem.source.n_rows * problem.n_outputs)
-        problem = replace(problem, noise_cv=None, max_iter=min(problem.max_iter, _ROUGH_ITER), tol=tol)
-    return fit_model(problem, rng, monitor, previous)
 
 
 class EVGPRegressor(GaussianProcess):
@@ -311,7 +299,14 @@ class EVGPRegressor(GaussianProcess):
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
             numbers = None if noise.inputs is None else self._numbers(data)
-            calibration = calibrate(data, problem, partial(_fit_roughly, rng=rng, monitor=monitor), rng, monitor)
+
+            def fit(problem: Problem, before: Fitted | None, rough: bool, about: str) -> Fitted:
+                if rough:
+                    tol = max(problem.tol or 0.0, rough_tol(problem))
+                    problem = replace(problem, noise_cv=None, max_iter=min(problem.max_iter, ROUGH_ITER), tol=tol)
+                return fit_model(problem, rng, monitor.seen_as(about=about), before)
+
+            calibration = calibrate(data, problem, fit, rng, monitor, (previous, self._theta))
             if calibration is not None:
                 data, problem, fitted = calibration.data, calibration.problem, calibration.fitted
             else:
@@ -348,7 +343,8 @@ class EVGPRegressor(GaussianProcess):
         """Add new rows to the posterior exactly. Kernel, noise and inducing points stay the same.
 
         The first call is a `fit`. After Adam, q moves to its optimum. If the noise variance is below 1e-8 of the signal
-        variance, ``lower_bound_`` and ``upper_bound_`` are accurate to about a nat.
+        variance, ``lower_bound_`` and ``upper_bound_`` are accurate to about a nat. Features with parameters stay
+        linearised at the ``theta_`` of `fit`. Call `fit` with all rows if ``theta_`` moves far.
 
         Parameters
         ----------
@@ -399,9 +395,11 @@ class EVGPRegressor(GaussianProcess):
                 by_inputs, _ = look_at_slopes(self._posterior, data, numbers, covariance, self._columns_changed)
                 noisier = relative_noise(by_inputs, self._posterior.predictor.noise, data.chosen)
             self._fitted = fitted.updated(data.source, fading, noisier)
+            found = self._fitted.predictor()
             if self._theta is not None:
                 self._theta, self._fitted = after_more_rows(self._theta, maps.feature_map, self._fitted)
-            self._posterior = replace(self._posterior, predictor=self._fitted.predictor())
+                found = self._theta.predictor(self._fitted)
+            self._posterior = replace(self._posterior, predictor=found)
             self._set_weights_and_noise()
             self._set_weights_of_rows(data)
         return self

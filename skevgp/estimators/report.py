@@ -15,6 +15,8 @@ from sklearn.utils import check_consistent_length, check_random_state
 
 from ..exceptions import ignored
 from ..fitting.prior import CoefPrior
+from ..fitting.theta import restricted
+from ..model.predictor import CoefficientPrior
 from ..noise import as_noise
 from ..utils.optional import require
 from ..utils.sklearn import safe_indexing
@@ -217,7 +219,7 @@ def feature_report(
     if not hasattr(model, "coef_"):
         raise ValueError("The model has no features: it was fitted with feature_map=None.")
     check_integer(n_splits, "n_splits", minimum=2)
-    prior = model._fitted.units.prior.outputs(slice(0, 1) if model._posterior.predictor.shared else slice(None))
+    prior = _prior_of(model).outputs(slice(0, 1) if model._posterior.predictor.shared else slice(None))
     labels = np.atleast_2d(model.coef_groups_)
     labels = np.where(labels == "", "features", labels)
     # A weight that cannot move is no part of a group, unless all are left out.
@@ -256,6 +258,11 @@ def feature_report(
     return FeatureReport(tuple(found), "rows" if trajectories is None else "trajectories")
 
 
+def _prior_of(model: Any) -> CoefficientPrior:
+    """The prior of the weights of features, before its scales were learned."""
+    return restricted(model._fitted.units.prior, model.coef_.shape[-1])
+
+
 def _verdict(losses: np.ndarray, loss: float, error: float) -> str:
     """Return what held-out losses (n,), their mean and its standard error say of a group."""
     middle = float(np.median(losses))
@@ -271,7 +278,7 @@ def _of_weights(model: Any, name: str, mask: np.ndarray) -> FeatureGroup:
         np.atleast_2d(values)[mask]
         for values in (model.coef_, model.coef_std_, model.coef_prior_mean_, model.coef_prior_scale_)
     )
-    given = model._fitted.units.prior.scale[: len(mask)][mask]
+    given = _prior_of(model).scale[: len(mask)][mask]
     free = (prior_std > 0.0) & np.isfinite(prior_std)
     if not free.any():
         # Weights that are fixed, or have no prior.

@@ -241,6 +241,8 @@ def of_inverse_dynamics(model: Any, joints: Sequence[str]) -> ModelSummary:
             numbers.append(Parameter(joint, "at rest", "", float(model.standing_std_[index])))
         if model.gains_std_[index] > 0.0:
             numbers.append(Parameter(joint, "gain", "", float(model.gains_[index]), float(model.gains_std_[index])))
+    if model._theta is not None:
+        numbers += _of_theta(model._theta)
     outputs_text = f"{len(joints)} output{'s' if len(joints) > 1 else ''}"
     return ModelSummary(
         f"{type(model).__name__}, {len(model.coef_)} weights, for {outputs_text}",

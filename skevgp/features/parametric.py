@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ..exceptions import ignored
 from ..utils.sklearn import StrOptions, check_feature_names_in, fit_context
 from ..utils.state import StatefulEstimator
 from .theta import Prior, check_prior
@@ -260,6 +261,10 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         return np.asarray(self._at(X, self.theta_), dtype=np.float64)
 
     def _at(self, X: Any, theta: Mapping[str, Any]) -> Any:
+        if type(X) is np.ndarray:
+            # A function that writes into X would change the user's rows.
+            X = X.view()
+            X.flags.writeable = False
         values = self.function(X, **theta)
         if not hasattr(values, "ndim"):
             values = anp.array(values)
@@ -270,7 +275,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
 
         def along(direction: np.ndarray) -> np.ndarray:
             try:
-                value, slope = make_jvp(function)(at)(direction)
+                with ignored("Output seems independent"):
+                    value, slope = make_jvp(function)(at)(direction)
             except Exception as error:
                 raise ValueError(
                     f"autograd cannot differentiate {self!r}: {error} Write the function in autograd.numpy, or use "
@@ -297,6 +303,8 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
             raise ValueError("parameters is empty: a function without parameters is a FunctionTransformer.")
         for name, prior in self.parameters.items():
             check_prior(prior, name)
+        if others := [name for name in self.units or {} if name not in self.parameters]:
+            raise ValueError(f"units={self.units!r} names {others}, which are no parameters.")
         try:
             own = list(inspect.signature(self.function).parameters.values())[1:]
         except (TypeError, ValueError):
@@ -306,9 +314,12 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         for one in own:
             if one.name in names and one.default is one.empty and one.name not in self.parameters:
                 check_prior(None, one.name)
-        unknown = [name for name in (*self.parameters, *(self.units or {})) if name not in names]
+        unknown = [name for name in self.parameters if name not in names]
         if unknown and not open_ended:
-            raise ValueError(f"The function {self.function!r} has no parameters {unknown}; it has {sorted(names)}.")
+            raise ValueError(
+                f"The function {self.function!r} has no parameters {unknown}; those that can be passed by name are "
+                f"{sorted(names)}."
+            )
 
     def _try(self, X: np.ndarray) -> None:
         """Raise a ValueError unless the function returns finite numbers of one shape over the prior."""

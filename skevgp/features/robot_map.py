@@ -322,7 +322,8 @@ class ParametricMap(RobotTransformer):
     @property
     def units(self) -> dict[str, str]:
         """Units of the parameters, for `summary`."""
-        return {name: self._unit(kind, joints) for name, (kind, joints) in self._targets.items()}
+        targets = getattr(self, "_targets", {})
+        return {name: self._unit(kind, joints) for name, (kind, joints) in targets.items()}
 
     def _prepare_parameters(self) -> None:
         self._targets = self._checked_parameters()

@@ -71,11 +71,6 @@ class Prior(ABC):
         """
         return self._coordinate(value)
 
-    @property
-    def broad(self) -> bool:
-        """Whether there may be several optima within the prior, so that a fit tries many values as starts."""
-        return False
-
     @abstractmethod
     def _value(self, z: float) -> float: ...
 
@@ -158,11 +153,6 @@ class LogNormal(Prior):
         check_real(self.median, "median", minimum=0.0, strict=True)
         check_real(self.sigma, "sigma", minimum=0.0, strict=True)
 
-    @property
-    def broad(self) -> bool:
-        """Whether sigma is above 0.5, so that a fit tries many values as starts."""
-        return self.sigma > 0.5
-
     def _value(self, z: float) -> float:
         return float(self.median * np.exp(self.sigma * z))
 
@@ -202,11 +192,6 @@ class Uniform(Prior):
         check_real(self.high, "high")
         if not self.low < self.high:
             raise ValueError(f"low={self.low!r} must be below high={self.high!r}.")
-
-    @property
-    def broad(self) -> bool:
-        """Always: a fit tries many values as starts."""
-        return True
 
     def _value(self, z: float) -> float:
         # θ = low + (high - low) Φ(z): uniform if z is standard normal.

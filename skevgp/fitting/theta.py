@@ -7,7 +7,7 @@ integrated out, to first order. Given kernel and noise, ẑ is the mode of p(z |
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,6 +22,7 @@ from ..data.dataset import Dataset
 from ..data.maps import evenly_spaced, take_rows, transformed
 from ..data.rows import Source, times_weights
 from ..exceptions import UnidentifiedWarning, warn_user
+from ..features.theta import Prior
 from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
 from ..model.predictor import CoefficientPrior, Predictor
 from ..model.weights import ThetaStep, WeightLikelihood, likelihood_of_whitened, theta_step
@@ -36,11 +37,11 @@ _LONGEST, _HALVINGS = 1.0, 7
 # Another fit follows, up to so many in all, if the features of the last one were not linear in θ on the way to its
 # mode: if their errors have an rms of more than this many standard deviations of the noise.
 _NONLINEAR, _FITS = 0.1, 4
-# Number of rows for the starts, of values of θ that are tried per parameter with a narrow or a broad prior, and of the
-# best of them that are improved.
-_START_ROWS, _TRIED_NARROW, _TRIED_BROAD, _IMPROVED = 500, 4, 64, 2
+# Number of rows for the starts. On fewer rows, so many values of θ are tried per parameter, and at most so many in all.
+# The best of them are improved.
+_START_ROWS, _TRIED_ROWS, _TRIED, _MOST_TRIED, _IMPROVED = 500, 100, 64, 256, 2
 # Columns of ∂h/∂z that are 0 on so many rows are left out.
-_SEEN_ROWS = 5000
+_SEEN_ROWS = 1000
 # Values of all z at which columns of ∂h/∂z are found.
 _TRIED_SLOPES = (0.0, 0.37, -0.61)
 # A Newton step that is longer than so many posterior standard deviations, but does not raise log p(y, z) at any length,
@@ -53,6 +54,8 @@ _APART, _AS_GOOD = 0.5, 1.5
 _TURNS, _LEAST_RESIDUAL = 3, 1e-14
 # Number of starts with a Gaussian process.
 _STARTS = 3
+# Fits from several starts begin with so many iterations, and a tolerance of so many nats per row and output.
+ROUGH_ITER, _ROUGH_TOL = 60, 1e-3
 # Step of differences, in posterior standard deviations. A second derivative that is below this share of Gauss and
 # Newton's is one of rounding errors, or of a kink.
 _DIFFERENCE, _FLAT = 0.1, 0.1
@@ -83,8 +86,8 @@ class FitOfTheta(Protocol):
         """The predictor of all outputs, in the user's units."""
 
 
-# Takes a problem, an earlier fit to continue and whether a rough result is enough.
-FitProblem = Callable[[Problem, Any, bool], Any]
+# Takes a problem, an earlier fit to continue, whether a rough result is enough, and what it is for the progress.
+FitProblem = Callable[[Problem, Any, bool, str], Any]
 # Takes z and the step before. None: the features are not finite at z.
 StepAt = Callable[[np.ndarray, ThetaStep], ThetaStep | None]
 
@@ -124,15 +127,32 @@ class ThetaPosterior:
     covariance: np.ndarray
     # Nats by which the models' log likelihoods, each given the other outputs, are above that of all outputs together.
     counted_twice: float = 0.0
+    # The result of `_Calibrator.bend`.
+    bend: np.ndarray | None = None
+    # (o, d, q): K of `model.weights`, without parameters that no output depends on.
+    K: np.ndarray | None = None
 
     @classmethod
-    def of(cls, theta: Theta, step: ThetaStep, together: bool) -> ThetaPosterior:
-        """The posterior for features that are linear in z, as they are at a step.
+    def of(cls, theta: Theta, step: ThetaStep, together: bool, bend: np.ndarray | None = None) -> ThetaPosterior:
+        """The posterior for features that are linear in z, as they are at a step, or have a bend.
 
         ``together``: no nats are counted twice.
         """
         twice = 0.0 if together else step.counted_twice()
-        return cls(theta, step.z + step.newton(), step.deviation().covariance, twice)
+        R = step.deviation().root
+        RA = R if bend is None else R @ bend
+        move = RA @ (R @ (step.gradient.sum(axis=0) - step.z))
+        K = step.K[:, :, np.abs(step.K).max(axis=(0, 1), initial=0.0) > 0.0]
+        return cls(theta, step.z + move, RA @ RA.T, twice, bend, K)
+
+    def predictor(self, fitted: Any) -> Predictor:
+        """The predictor of a fit, with outputs that share θ."""
+        found: Predictor = fitted.predictor()
+        return found if self.K is None else found.with_theta(self.K)
+
+    def z_under(self, priors: Sequence[Prior]) -> np.ndarray:
+        """The coordinates (q,) of the mean under other priors of the same parameters."""
+        return np.array([p.coordinate(own) for p, own in zip(priors, self.theta.values(self.mean), strict=True)])
 
     def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
         """Posterior medians and standard deviations by name, and the covariance (q, q) of the parameters."""
@@ -262,18 +282,26 @@ class _Calibrator:
 
     def value_alone(self, z: np.ndarray, noise: np.ndarray) -> float:
         """The log density of the sample and z without a Gaussian process. -inf: the features are not finite."""
-        features = _values_or_nan(partial(transformed, map_at(self.feature_map, z)), self.sample)
-        step = self._alone(features, z, noise, self.columns[:0])
+        chosen = evenly_spaced(len(self.targets), _TRIED_ROWS)
+        features = _values_or_nan(partial(transformed, map_at(self.feature_map, z)), take_rows(self.sample, chosen))
+        step = self._alone(features, z, noise, self.columns[:0], chosen)
         return -np.inf if step is None else step.value
 
-    def _alone(self, features: np.ndarray, z: np.ndarray, noise: np.ndarray, columns: np.ndarray) -> ThetaStep | None:
+    def _alone(
+        self,
+        features: np.ndarray,
+        z: np.ndarray,
+        noise: np.ndarray,
+        columns: np.ndarray,
+        chosen: slice | np.ndarray = slice(None),
+    ) -> ThetaStep | None:
         if not np.isfinite(features).all():
             return None
         likelihoods = []
         prior = replace(self.prior, reference=np.zeros_like(self.prior.reference))
         for o, variance in enumerate(noise):
             H = features if features.ndim == 2 else features[:, o]
-            r = self.targets[:, o] - H[:, : self.p] @ prior.mean[o]
+            r = self.targets[chosen, o] - H[:, : self.p] @ prior.mean[o]
             likelihoods.append(likelihood_of_whitened(H / np.sqrt(variance), r / np.sqrt(variance)))
         return theta_step(likelihoods, prior, columns, z)
 
@@ -291,19 +319,20 @@ class _Calibrator:
         moved -= times_weights(then[..., p:], after.K @ (after.z - before.z))
         return np.mean(moved**2, axis=0)
 
+    def at(self, z: np.ndarray) -> ThetaStep:
+        """What the sample says about z at a value, with the noise of the residuals there."""
+        squares = np.mean(self.targets**2, axis=0)
+        first = self._known(self.alone(z, np.where(squares > 0.0, squares, 1.0)))
+        return self._known(self.alone(z, self.residual_variance(first)))
+
     def starts(self, seed: int) -> list[ThetaStep]:
         """Different optima of the features alone, the best one first."""
         q = len(self.theta)
-        n_tried = sum(_TRIED_BROAD if prior.broad else _TRIED_NARROW for prior in self.theta.priors)
-        tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(int(np.ceil(np.log2(n_tried)))))
+        n_tried = int(np.ceil(np.log2(min(_TRIED * q, _MOST_TRIED))))
+        tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(n_tried))
         squares = np.mean(self.targets**2, axis=0)
         first = self.alone(np.zeros(q), np.where(squares > 0.0, squares, 1.0))
-        if first is None:
-            raise ValueError(
-                f"The features or their derivatives in the parameters {list(self.theta.names)} are NaN or infinite at "
-                "the prior medians."
-            )
-        noise = self.residual_variance(first)
+        noise = self.residual_variance(self._known(first))
         found = [self.improved(np.zeros(q), noise)]
         values = [self.value_alone(z, noise) for z in tried]
         best = [tried[i] for i in np.argsort(values)[::-1][:_IMPROVED] if np.isfinite(values[i])]
@@ -319,14 +348,21 @@ class _Calibrator:
 
     def improved(self, z: np.ndarray, noise: np.ndarray) -> tuple[ThetaStep, np.ndarray]:
         """An optimum of the features alone from z, and the mean squared residuals (o,) there."""
-        step = self.alone(z, noise)
+        step = self._known(self.alone(z, noise))
         for _ in range(_TURNS):
-            assert step is not None
             step = climbed(step, self._with_noise(noise))
             noise = self.residual_variance(step)
-            step = self.alone(step.z, noise)
-        assert step is not None
+            step = self._known(self.alone(step.z, noise))
         return step, noise
+
+    def _known(self, step: ThetaStep | None) -> ThetaStep:
+        if step is None:
+            raise ValueError(
+                f"The features or their derivatives in the parameters {list(self.theta.names)} are NaN or infinite at "
+                "values at which they were tried. Give the parameters narrower priors. The same rows must also always "
+                "have the same features."
+            )
+        return step
 
     def _with_noise(self, noise: np.ndarray) -> StepAt:
         return lambda z, before: self.alone(z, noise)
@@ -354,28 +390,23 @@ class _Calibrator:
 
     def settled(self, step: ThetaStep, fitted: FitOfTheta) -> ThetaStep:
         """The mode of z under the kernel and noise of a fit."""
-        here = self.step_at(fitted, step.z, step)
-        assert here is not None
+        here = self._known(self.step_at(fitted, step.z, step))
         return climbed(here, partial(self.step_at, fitted))
 
-    def covariance_of_best_fit(self, step: ThetaStep, fitted: FitOfTheta) -> np.ndarray:
-        """The posterior covariance (q, q) of z if f is orthogonal to the features."""
+    def bend(self, step: ThetaStep, fitted: FitOfTheta) -> np.ndarray | None:
+        """The inverse of A (q, q), below, if f is orthogonal to the features. None: it is the identity."""
         # z is then that of the best fit in least squares, where the gradient s(z) = σ⁻² Jᵀ (y - h(z)) - z is 0. The
-        # residuals contain f and may be large, so that Gauss and Newton's s' = -Λ = -(L Lᵀ)⁻¹ is not good enough. As
-        # Var[s] is Λ to first order, the covariance is (s')⁻¹ Λ (s')⁻ᵀ = L (AᵀA)⁻¹ Lᵀ with A = -Lᵀ s' L (White 1982).
-        deviation = step.deviation()
-        L, columns = deviation.W * deviation.widths, []
-        for direction in L.T:
+        # residuals contain f and may be large, so that Gauss and Newton's s' = -Λ is not good enough. As Var[s] is Λ to
+        # first order, the covariance is (s')⁻¹ Λ (s')⁻ᵀ = R A⁻¹ A⁻ᵀ R with R = Λ^(-1/2) and A = -R s' R (White 1982).
+        R, columns = step.deviation().root, []
+        for direction in R:
             ends = [self.step_at(fitted, step.z + sign * _DIFFERENCE * direction, step) for sign in (1.0, -1.0)]
             if ends[0] is None or ends[1] is None:
-                return deviation.covariance
+                return None
             forward, back = (end.gradient.sum(axis=0) - end.z for end in ends if end is not None)
-            columns.append(L.T @ (back - forward) / (2.0 * _DIFFERENCE))
-        _, sizes, Wt = np.linalg.svd(np.array(columns).T)
-        if sizes.min() < _FLAT:
-            return deviation.covariance
-        LA = L @ (Wt.T / sizes)
-        return LA @ LA.T
+            columns.append(R @ (back - forward) / (2.0 * _DIFFERENCE))
+        A = np.array(columns).T
+        return None if np.linalg.svd(A, compute_uv=False).min() < _FLAT else np.linalg.inv(A)
 
 
 def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
@@ -425,12 +456,20 @@ def _sample(data: Dataset, size: int) -> tuple[Any, np.ndarray]:
 
 
 def calibrate(
-    data: Dataset, problem: Problem, fit: FitProblem, rng: np.random.RandomState, monitor: Monitor
+    data: Dataset,
+    problem: Problem,
+    fit: FitProblem,
+    rng: np.random.RandomState,
+    monitor: Monitor,
+    previous: tuple[Any, ThetaPosterior | None] = (None, None),
 ) -> Calibration | None:
     """Fit a problem whose feature map has parameters, or return None if it has none.
 
-    ``problem`` is that of the prior medians. The prior of the weights is found there.
+    ``problem`` is that of the prior medians. The prior of the weights is found there. If the parameters are those of
+    ``previous``, a fit and its posterior, the fit continues that one.
     """
+    if data.maps.kernel_map is not None and (of_kernel := Theta.of(data.maps.kernel_map)) is not None:
+        raise ValueError(f"Only a feature_map may have parameters; those of kernel_map are {list(of_kernel.names)}.")
     theta = None if data.maps.feature_map is None else Theta.of(data.maps.feature_map)
     if theta is None:
         return None
@@ -441,33 +480,48 @@ def calibrate(
             f'posterior="full", and Gaussian noise of y only; got solver={solver!r} and noise={noise!r}.'
         )
     own = _Calibrator(data, problem, theta)
-    best: tuple[float, ThetaStep, Any] | None = None
-    starts = own.starts(rng.randint(np.iinfo(np.int32).max))
-    step = starts[0]
-    fitted: Any = None
-    for start in starts if len(starts) > 1 else ():
-        rough = fit(own.problem_at(start, own.data_at(start.z)), None, True)
+    fitted, before = previous
+    seed, goes_on = rng.randint(np.iinfo(np.int32).max), before is not None and before.theta.names == theta.names
+    if goes_on and before is not None:
+        starts = [own.at(before.z_under(theta.priors))]
+    else:
+        fitted, starts = None, own.starts(seed)
+    step, best = starts[0], -np.inf
+    for number, start in enumerate(starts if len(starts) > 1 else (), start=1):
+        rough = fit(own.problem_at(start, own.data_at(start.z)), None, True, f"parameters, start {number}")
+        if monitor.stopped or monitor.out_of_time:
+            break
         start = own.settled(start, rough)
         bound = own.finished(start, own.data_at(start.z), rough).lower_bound
         bound -= 0.0 if own.together else start.counted_twice()
-        if best is None or bound > best[0]:
-            best = bound, start, rough
-            _, step, fitted = best
-    for _ in range(_FITS):
-        fitted, before = fit(own.problem_at(step, own.data_at(step.z)), fitted, False), step
-        step = own.settled(step, fitted)
-        ended = problem.max_iter == 0 or monitor.stopped or monitor.out_of_time
-        if ended or (own.nonlinearity(before, step) < _NONLINEAR**2 * fitted.predictor().noise).all():
+        if bound > best:
+            best, step, fitted = bound, start, rough
+    # Without a fit of the noise, the optimum of the features alone is better than a step under a first guess.
+    noise_known = goes_on or problem.max_iter > 0 or problem.spec.starts.noise.value is not None
+    trusted = True
+    for number in range(1, _FITS + 1):
+        at_start = step
+        fitted = fit(own.problem_at(step, own.data_at(step.z)), fitted, False, f"parameters, fit {number}")
+        ended = monitor.stopped or monitor.out_of_time
+        trusted = noise_known and not ended
+        if trusted:
+            step = own.settled(step, fitted)
+        ended = ended or problem.max_iter == 0
+        if ended or (own.nonlinearity(at_start, step) < _NONLINEAR**2 * fitted.predictor().noise).all():
             break
     at_mode = own.data_at(step.z)
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
-    posterior = ThetaPosterior.of(found, step, own.together)
-    if _length(step.newton(), step) > _MOVED:
+    bend = own.bend(step, fitted) if problem.orthogonal and trusted else None
+    posterior = ThetaPosterior.of(found, step, own.together, bend)
+    if not trusted or _length(step.newton(), step) > _MOVED:
         posterior = replace(posterior, mean=step.z)
-    if problem.orthogonal:
-        posterior = replace(posterior, covariance=own.covariance_of_best_fit(step, fitted))
     return Calibration(at_mode, own.problem_at(step, at_mode), own.finished(step, at_mode, fitted), posterior)
+
+
+def rough_tol(problem: Problem) -> float:
+    """The tolerance, in nats, of fits that only choose between starts."""
+    return _ROUGH_TOL * problem.source.n_rows * problem.n_outputs
 
 
 def after_more_rows(
@@ -479,4 +533,5 @@ def after_more_rows(
     z = posterior.theta.coordinates()
     step = theta_step(fitted.weight_likelihoods(), prior, linearized.columns, z)
     together = prior.shared or fitted.models[0].sparse.orthogonal
-    return ThetaPosterior.of(posterior.theta, step, together), fitted.reweighted(extended(prior, step))
+    found = ThetaPosterior.of(posterior.theta, step, together, posterior.bend)
+    return found, fitted.reweighted(extended(prior, step))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..robots import body_parameters, layout_of, nearest_consistent, physical_consistency, with_parameters, write_urdf
 from ..utils.validation import check_integer, check_magnitude, check_real, validate_numbers
 from .joint_residual import JointResidual
+from .moves import EFFECTS, terms
 from .payload import find_payload, payload_prior
 from .torque_regression import TorqueRegression
 from .weights import Known
@@ -214,8 +216,9 @@ class IdentifiedRobot(TorqueRegression):
         """Estimate the payload of the robot from a log with the payload.
 
         All parameters of the robot and the ten parameters of the payload are identified again from both logs. The
-        uncertainty of the robot therefore widens the interval of the payload. The mean of each f_j is subtracted as if
-        it were known. `InverseDynamics.update` does not count.
+        uncertainty of the robot therefore widens the interval of the payload. Offset, friction and gain of each move
+        differ as much as those of the moves of `fit`. The mean of each f_j is subtracted as if it were known.
+        `InverseDynamics.update` does not count.
 
         Parameters
         ----------
@@ -278,5 +281,22 @@ class IdentifiedRobot(TorqueRegression):
         def missed(torque: np.ndarray) -> np.ndarray:
             return np.column_stack([f.mean(self._own(rows_x, torque, j)) for j, f in enumerate(self._joints)])
 
-        prior = payload_prior(self._weights.prior, mass_scale, size)
-        return find_payload(rows, link % n_outputs, prior, self._known, missed)
+        def effects(torque: np.ndarray) -> np.ndarray:
+            return self._effects(torque, rows.speed)
+
+        # Without labels, the log is one move.
+        rows = replace(rows, groups=np.zeros(len(rows_x), dtype=int)) if groups is None else rows
+        n_effects = len(np.unique(rows.groups)) * n_outputs * len(EFFECTS)
+        prior = payload_prior(self._weights.prior, n_effects, mass_scale, size)
+        torque = self._weights.predict(rows.features)
+        return find_payload(rows, link % n_outputs, prior, self._known, torque, missed, effects)
+
+    def _terms(self, physics: np.ndarray, speed: np.ndarray) -> list[np.ndarray]:
+        """Return z of each joint, (n, 4)."""
+        columns = zip(self._joints, speed.T, physics.T, strict=True)
+        return [terms(v, torque, joint.noise.velocity) for joint, v, torque in columns]
+
+    def _effects(self, physics: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return z of each joint in standard deviations of the effects of moves, (n, o, 4)."""
+        each = zip(self._joints, self._terms(physics, speed), strict=True)
+        return np.stack([z * np.sqrt(np.diag(joint.effects.covariance)) for joint, z in each], axis=1)

@@ -29,7 +29,7 @@ from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
 from .log_check import check_of
-from .moves import FEWEST_MOVES, MoveEffects, of_move, terms
+from .moves import FEWEST_MOVES, MoveEffects, of_move
 from .rows_of_logs import evenly_spread
 from .weaknesses import weaknesses
 from .weights import Fold, Rows, condensed, folds
@@ -75,12 +75,13 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Whether to move the weights to the most probable physical ones (masses above 0, positive definite
         pseudo-inertias). Covariances and noise do not change.
     stiction_velocity : "auto" or None, default="auto"
-        If ``"auto"``, find the speed above which the sign of friction of each joint is known, which needs at least
-        three ``groups``. If None, use that of `RigidBodyRegressor`.
+        If ``"auto"``, find the velocity v_s of the mean friction :math:`F \tanh(\dot q / v_s)` of each joint with its
+        uncertainty (``theta_``). If None, use that of `RigidBodyRegressor`.
     learn_scales : bool, default=True
         Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
-        it. Factors are from 1e-4 to 1e4.
+        it. Factors are from 1e-4 to 1e4. With ``gain_scale``, that of inertial parameters is at least 1: torques do
+        not show a common error of masses and gains.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -103,6 +104,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
         Prior means and learned prior standard deviations of β. Torques do not determine a weight whose standard
         deviation is still that of the prior.
+    theta_, theta_std_ : dict of str to float
+        Posterior medians of the v_s of mean friction :math:`F \tanh(\dot q / v_s)`, rad/s or m/s, and their standard
+        deviations to first order, such as ``theta_["stiction_velocity(q1)"]``. Empty if they are not found.
     gains_, gains_std_ : ndarray of shape (n_outputs,)
         Gains 1 + c and their standard deviations. Torques of the model times gains are those of y.
     noise_variance_ : ndarray of shape (n_outputs,)
@@ -144,14 +148,14 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     Notes
     -----
-    Weights are fitted first by Bayesian regression, together with noise, static friction and gains. Filtered rows count
-    less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a training row is
-    predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as large as the
-    residuals, and its length scales are at most three standard deviations of their column and, except that of the
-    speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn. Weights
-    and f_j are then fitted again. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that errors
-    fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j fades.
-    Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
+    Weights are fitted first by Bayesian regression, together with noise, static friction, its velocities and gains.
+    Filtered rows count less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a
+    training row is predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as
+    large as the residuals, and its length scales are at most three standard deviations of their column and, except that
+    of the speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn.
+    Weights and f_j are then fitted again. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that
+    errors fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j
+    fades. Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
 
     References
     ----------
@@ -287,7 +291,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         with ignored(category=RobotModelWarning):  # given already
             self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)
-        self._known, self._n_moves = condensed(rows, self._weights), rows.n_moves
+        self._n_moves = rows.n_moves
         if self.consistent and self._has_robot:
             size = 10 * targets.shape[1]
             start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
@@ -301,8 +305,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         doubts = []
         if self._has_robot:
             doubts = [doubt] if (doubt := self._doubt(rows_x, targets, is_doubtful)) else []
-            doubts += weaknesses(rows, self._weights, self._outputs)
+            doubts += weaknesses(rows, self._weights, len(self._names(targets.shape[1])), self._outputs)
         self._joints = self._residuals(rows_x, rows)
+        self._known = condensed(rows, self._weights, self._effects(self._weights.predict(rows.features), rows.speed))
         self._set_attributes()
         return doubts
 
@@ -311,7 +316,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         is_far = self._weights.surprise > _FAR or bool(self._unexplained)
         causes: list[str] = []
         if is_far or is_doubtful:
-            prior, size = self._weights.prior, self._weights.n_weights
+            prior, size = self._weights.prior, len(self._names(y.shape[1]))
             own = prior.mean[:size], prior.covariance[:size, :size]
             causes = likely_causes(self.feature_map_, X, y, own, is_far=is_far)
         if not is_far and not causes:
@@ -364,14 +369,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     def _set_attributes(self) -> None:
         weights, n_outputs = self._weights, len(self._joints)
-        p = weights.n_weights
+        p, n = len(self._names(n_outputs)), weights.n_weights
         std = np.sqrt(np.maximum(np.diag(weights.covariance), 0.0))
         self.coef_, self.coef_std_, self.coef_cov_ = weights.mean[:p], std[:p], weights.covariance[:p, :p]
         self.coef_names_ = self._names(n_outputs)
+        self.theta_, self.theta_std_ = ({}, {}) if self._theta is None else self._theta.attributes()[:2]
         self.coef_prior_mean_ = weights.prior.mean[:p]
         self.coef_prior_scale_ = np.sqrt(np.diag(weights.prior.covariance)[:p])
         self.gains_ = weights.gains(n_outputs)
-        self.gains_std_ = std[p:] if len(std) > p else np.zeros(n_outputs)
+        self.gains_std_ = std[n:] if len(std) > n else np.zeros(n_outputs)
         noise = [joint.noise for joint in self._joints]
         self.noise_variance_ = np.array([one.variance for one in noise])
         self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])
@@ -430,11 +436,6 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
                 mean[:, j] += more
                 variance[:, j] += uncertain
         return mean, variance
-
-    def _terms(self, physics: np.ndarray, speed: np.ndarray) -> list[np.ndarray]:
-        """Return z of each joint, (n, 4)."""
-        columns = zip(self._joints, speed.T, physics.T, strict=True)
-        return [terms(v, torque, joint.noise.velocity) for joint, v, torque in columns]
 
     def _noise(self, speed: np.ndarray) -> np.ndarray:
         """Return the variance of the noise, (n, o)."""

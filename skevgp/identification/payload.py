@@ -8,41 +8,58 @@ from dataclasses import replace
 import numpy as np
 from sklearn.utils import Bunch
 
-from .weights import Known, Prior, Rows, identify
+from .weights import Known, Prior, Rows, identify, with_others
 
 # Half width of the 95 % interval of a normal distribution, in standard deviations.
 _95 = 1.959963984540054
 
 
-def payload_prior(prior: Prior, mass_scale: float, size: float) -> Prior:
-    """Add a body with ten nearly unknown parameters to the prior of a robot, between its weights and its gains."""
+def payload_prior(prior: Prior, n_effects: int, mass_scale: float, size: float) -> Prior:
+    """Add effects of moves, and a body with ten nearly unknown parameters, to the prior of a robot."""
     # The mass has mean 0 and standard deviation mass_scale (kg). First moments have size (m) times that, and moments of
     # inertia size² times that.
-    p, total = len(prior.scaled), len(prior.mean)
-    robot = np.concatenate([np.arange(p), np.arange(p + 10, total + 10)])
-    mean, covariance = np.zeros(total + 10), np.zeros((total + 10, total + 10))
-    mean[robot] = prior.mean
-    covariance[np.ix_(robot, robot)] = prior.covariance
     body = mass_scale * np.concatenate([[1.0], np.full(3, size), np.full(6, size**2)])
-    covariance[range(p, p + 10), range(p, p + 10)] = body**2
-    return replace(prior, mean=mean, covariance=covariance, scaled=np.append(prior.scaled, np.ones(10, dtype=bool)))
+    return with_others(with_others(prior, np.ones(n_effects)), body**2, scaled=True)
 
 
 def find_payload(
-    rows: Rows, link: int, prior: Prior, known: Known, residual: Callable[[np.ndarray], np.ndarray], rounds: int = 2
+    rows: Rows,
+    link: int,
+    prior: Prior,
+    known: Known,
+    torque: np.ndarray,
+    residual: Callable[[np.ndarray], np.ndarray],
+    effects: Callable[[np.ndarray], np.ndarray],
+    rounds: int = 2,
 ) -> Bunch:
     """Identify the body on a link (from 0) from rows with the payload, given rows without it as ``known``."""
     # Weights and gains are identified again from both logs, because each log determines their product only. residual
-    # returns the Gaussian processes' part of torques (n, o) of the model. It depends on the load, and the load depends
-    # on it, so that there are several rounds.
+    # returns the Gaussian processes' part of torques (n, o) of the model, and effects the columns (n, o, k) of effects
+    # of a move, given torques without these effects. They depend on the load, and the load depends on them, so that
+    # there are several rounds, from the torque (n, o) without the load. Each move and output has its own effects, with
+    # weights N(0, I).
     body = rows.features[:, :, 10 * link : 10 * link + 10]
-    carried = replace(rows, features=np.concatenate([rows.features, body], axis=2))
-    nothing = np.zeros((*known.targets.shape, 10))
+    moves, (n, n_outputs, _) = [rows.groups == move for move in np.unique(rows.groups)], rows.features.shape
+
+    def with_load(torque: np.ndarray) -> Rows:
+        own = effects(torque)
+        columns = np.zeros((n, n_outputs, len(moves), n_outputs, own.shape[2]))
+        for number, move in enumerate(moves):
+            columns[move, :, number] = np.eye(n_outputs)[:, :, np.newaxis] * own[move][:, :, np.newaxis]
+        features = np.concatenate([rows.features, columns.reshape(n, n_outputs, -1), body], axis=2)
+        return replace(rows, features=features)
+
+    carried = with_load(torque)
+    others = carried.features.shape[2] - rows.features.shape[2]
+    nothing = np.zeros((*known.targets.shape, others))
     known = known._replace(features=np.concatenate([known.features, nothing], axis=2))
     weights = identify(carried, prior, known=known)
     for _ in range(rounds):
-        missed = residual(weights.predict(carried.features))
-        weights = identify(replace(carried, targets=rows.targets - missed), prior, start=weights, known=known)
+        alike = carried.features.copy()
+        alike[:, :, rows.features.shape[2] : -10] = 0.0
+        torque = weights.predict(alike)
+        carried = replace(with_load(torque), targets=rows.targets - residual(torque))
+        weights = identify(carried, prior, start=weights, known=known)
     p = weights.n_weights
     of = slice(p - 10, p)
     return _described(weights.mean[of], weights.covariance[of, of])

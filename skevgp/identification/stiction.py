@@ -1,4 +1,4 @@
-"""Noise of a joint at low speed, where Coulomb friction has no known sign."""
+"""Friction of a joint at low speed: noise, because Coulomb friction has no known sign there, and the mean."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from ..features import LogNormal
+
 # A joint moves if less than this share of the variance of friction at rest remains.
 _MOVING = 0.1
 # Limits of the speed v_s above which friction has a sign, rad/s or m/s.
 _SLOWEST, _FASTEST = 1e-3, 0.3
-# Candidates of v_s for mean friction, and its log-normal prior: usual value and standard deviation of the logarithm.
-_VELOCITIES = np.array([0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2])
-_USUAL, _USUAL_SPREAD = 0.015, 0.7
+# Prior of v_s of mean friction.
+VELOCITY_PRIOR = LogNormal(0.015, 0.7)
 
 
 def undecided(speed: np.ndarray, velocity: np.ndarray | float) -> np.ndarray:
@@ -96,19 +97,28 @@ def _most(errors: np.ndarray, least: float) -> float:
     return max(2.0 * float(np.max(errors**2)), 10.0 * least)
 
 
-def likeliest_velocity(
-    left: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, worth: float, least: float
-) -> float:
-    """Find the v_s in a grid whose mean friction F tanh(q̇ / v_s) leaves the smallest residual."""
-    # left (n,) is the residual of all weights, found with F (coulomb, with its sign) and v_s (velocity). F, viscous
-    # friction and an offset are fitted again for each candidate. A log-normal prior avoids the ends of the grid if the
-    # log has little information. worth rows have the information of an independent one. All rows count the same,
-    # because slow ones determine v_s.
-    target = left + coulomb * np.tanh(speed / velocity)
-    scale = worth * max(float(np.mean(left**2)), least)
-    losses = []
-    for candidate in _VELOCITIES:
-        terms = np.column_stack([np.tanh(speed / candidate), speed, np.ones_like(speed)])
-        error = target - terms @ np.linalg.lstsq(terms, target, rcond=None)[0]
-        losses.append(error @ error / scale + (np.log(candidate / _USUAL) / _USUAL_SPREAD) ** 2)
-    return float(_VELOCITIES[int(np.argmin(losses))])
+class MeanFriction(NamedTuple):
+    """Mean friction F tanh(q̇ / v_s) of joints, to first order in the coordinates of v_s (`features.theta.Prior`)."""
+
+    coulomb: np.ndarray  # (o,), F
+    z: np.ndarray  # (o,), the coordinates where it is linearised
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Return v_s, (o,)."""
+        return np.array([VELOCITY_PRIOR.value(z) for z in self.z])
+
+    def on(self, features: np.ndarray, speed: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return features (n, o, p) with these v_s, given their columns (o,) of Coulomb friction."""
+        changed = features.copy()
+        changed[:, range(len(self.z)), columns] = np.tanh(speed / self.velocity)
+        return changed
+
+    def slopes(self, speed: np.ndarray) -> np.ndarray:
+        """Return the derivatives of friction in z, (n, o, o): a diagonal matrix for each row of speeds (n, o)."""
+        # d tanh(q̇ / v_s) / d log v_s = -(q̇ / v_s) (1 - tanh²(q̇ / v_s)), and log v_s = const + sigma z.
+        velocity, n_joints = self.velocity, len(self.z)
+        by_log = -self.coulomb * speed / velocity * undecided(speed, velocity)
+        found = np.zeros((len(speed), n_joints, n_joints))
+        found[:, range(n_joints), range(n_joints)] = VELOCITY_PRIOR.sigma * by_log
+        return found

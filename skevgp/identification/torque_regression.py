@@ -1,4 +1,4 @@
-"""The regression of torques: rows of logs, features, the prior of weights, and speeds of static friction."""
+"""The regression of torques: rows of logs, features, the prior of weights, and velocities of friction."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from sklearn.base import clone
 from ..exceptions import RobotModelWarning, ignored
 from ..features import RigidBodyRegressor
 from ..fitting.prior import wide_scale
+from ..fitting.theta import ThetaPosterior
+from ..maps.theta import Theta
 from ..utils.state import StatefulEstimator
 from ..utils.validation import check_magnitude, checked_groups
 from .rows_of_logs import blocks_of, groups_of
-from .stiction import likeliest_velocity
-from .weights import Prior, Rows, Weights, identify, with_gains
+from .stiction import VELOCITY_PRIOR, MeanFriction
+from .weights import Prior, Rows, Weights, identify, with_gains, with_others
 
-# Maximum number of rounds for the speeds above which friction has a sign.
-_STICTION_ROUNDS = 3
+# Steps of the velocities of friction end if they are shorter than this share of a posterior standard deviation, or
+# after so many. The longest step, in prior standard deviations.
+_SETTLED, _VELOCITY_STEPS, _LONGEST = 0.1, 6, 1.0
 
 
 class TorqueRegression(StatefulEstimator):
@@ -31,6 +34,9 @@ class TorqueRegression(StatefulEstimator):
     learn_scales: bool
     feature_map_: Any
     _weights: Weights
+    # Where the columns after the weights are derivatives of friction, and the posterior of its parameters.
+    _friction_at: MeanFriction | None = None
+    _theta: ThetaPosterior | None = None
 
     @property
     def _has_robot(self) -> bool:
@@ -56,7 +62,9 @@ class TorqueRegression(StatefulEstimator):
         """Return H (n, o, p); without a robot, each output has its own weights and a constant."""
         H = self.feature_map_.transform(X)
         if H.ndim == 3:
-            return H
+            if self._friction_at is None:
+                return H
+            return np.concatenate([H, self._friction_at.slopes(self._speed(X, n_outputs))], axis=2)
         own = np.column_stack([H, np.ones(len(H))])
         features = np.zeros((len(H), n_outputs, n_outputs, own.shape[1]))
         features[:, range(n_outputs), range(n_outputs)] = own[:, np.newaxis]
@@ -79,41 +87,51 @@ class TorqueRegression(StatefulEstimator):
         return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
 
     def _find_weights(self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None) -> Rows:
-        """Find the weights and the speeds above which friction has a sign; returns the rows."""
+        """Find the weights and the velocities v_s of mean friction; returns the rows."""
+        self._friction_at = self._theta = None
         rows = self._as_rows(X, y, groups, pieces)
         prior = self._prior(rows)
-        self._weights = identify(rows, prior)
-        # One trajectory has little information on these speeds in others.
-        labels = checked_groups(groups, len(X))
-        several = labels is not None and labels.max() > 1
-        if not (several and self.stiction_velocity == "auto" and prior.coulomb is not None):
+        coulomb = prior.coulomb
+        if self.stiction_velocity is None or coulomb is None:
+            self._weights = identify(rows, prior)
             return rows
-        for _ in range(_STICTION_ROUNDS):
-            velocity = self._likeliest_velocities(rows)
-            if (velocity == prior.velocity).all():
+        # Gauss-Newton: the derivatives of friction in the coordinates of v_s join the features. Their weights are the
+        # step to the mode, with the posterior covariance of the coordinates there.
+        n_outputs = y.shape[1]
+        friction = MeanFriction(np.zeros(n_outputs), np.zeros(n_outputs))
+        features = friction.on(rows.features, rows.speed, coulomb)
+        self._weights = identify(replace(rows, features=features), replace(prior, velocity=friction.velocity))
+        p = self._weights.n_weights
+        own = slice(p, p + n_outputs)
+        prior = with_others(self._weights.prior, np.ones(n_outputs))
+        weights, z = self._weights.with_others(n_outputs), friction.z
+        direction, damping = np.zeros(n_outputs), np.ones(n_outputs)
+        for _ in range(_VELOCITY_STEPS):
+            friction = MeanFriction(weights.mean[coulomb], z)
+            features = friction.on(rows.features, rows.speed, coulomb)
+            linear = replace(rows, features=np.concatenate([features, friction.slopes(rows.speed)], axis=2))
+            mean = prior.mean.copy()
+            mean[own] = -z
+            weights = identify(linear, replace(prior, mean=mean, velocity=friction.velocity), start=weights)
+            step, std = weights.mean[own], np.sqrt(np.diag(weights.covariance)[own])
+            if (np.abs(step) < _SETTLED * std).all():
                 break
-            with ignored(category=RobotModelWarning):  # given already
-                self.feature_map_.set_params(stiction_velocity=velocity).fit(X)
-            rows = replace(rows, features=self._features(X, y.shape[1]))
-            prior = replace(self._weights.prior, velocity=velocity)
-            self._weights = identify(rows, prior, start=self._weights)
-        return rows
+            # Steps that turn around are too long.
+            damping = np.where(direction * step < 0.0, 0.5 * damping, damping)
+            direction, z = step, z + damping * np.clip(step, -_LONGEST, _LONGEST)
+        self._weights, self._friction_at = weights, friction
+        self._theta = self._velocities(friction.z + step, weights.covariance[own, own])
+        with ignored(category=RobotModelWarning):  # given already
+            self.feature_map_.set_params(stiction_velocity=friction.velocity).fit(X)
+        return linear
 
-    def _likeliest_velocities(self, rows: Rows) -> np.ndarray:
-        weights, prior = self._weights, self._weights.prior
-        left = rows.targets - weights.predict(rows.features)
-        return np.array(
-            [
-                likeliest_velocity(
-                    left[:, j],
-                    rows.speed[:, j],
-                    float(weights.mean[coulomb]),
-                    float(prior.velocity[j]),
-                    float(weights.correlation_time[j]),
-                    weights.noise[j].variance,
-                )
-                for j, coulomb in enumerate(prior.coulomb)  # type: ignore[arg-type]
-            ]
+    def _velocities(self, mean: np.ndarray, covariance: np.ndarray) -> ThetaPosterior:
+        """Return the posterior of v_s of all joints."""
+        n_outputs = len(mean)
+        names = tuple(f"stiction_velocity({joint})" for joint in self._output_names(n_outputs))
+        empty = ("",) * n_outputs
+        return ThetaPosterior(
+            Theta((), (0,) * n_outputs, names, names, (VELOCITY_PRIOR,) * n_outputs, empty), mean, covariance
         )
 
     def _map(self) -> RigidBodyRegressor:

@@ -15,8 +15,8 @@ _REST = 0.01
 _ROWS_PER_WEIGHT = 3.0
 
 
-def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
-    """Return sentences on what the rows of a robot do not tell."""
+def weaknesses(rows: Rows, weights: Weights, n_coef: int, names: list[str]) -> list[str]:
+    """Return sentences on what the rows of a robot do not tell. The first n_coef weights are those of its model."""
     said = []
     prior = weights.prior
     fastest = np.abs(rows.speed).max(axis=0)
@@ -26,7 +26,7 @@ def weaknesses(rows: Rows, weights: Weights, names: list[str]) -> list[str]:
             f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s), so that nothing is "
             "learned of their friction and inertia. Record motion of all joints."
         )
-    needed = np.sqrt(np.mean((rows.features @ prior.mean[: weights.n_weights]) ** 2, axis=0))
+    needed = np.sqrt(np.mean((rows.features[:, :, :n_coef] @ prior.mean[:n_coef]) ** 2, axis=0))
     torque = np.sqrt(np.mean(rows.targets**2, axis=0))
     idle = (torque < _NOT_DRIVEN * needed) & ~still
     if idle.any():

@@ -53,10 +53,11 @@ class Prior:
     velocity: np.ndarray  # (o,) speed below which friction has no sign
     # (P,): labels of groups whose standard deviations are learned. They are independent of each other. Empty: it stays.
     groups: np.ndarray | None = None
+    learned: bool = False  # whether standard deviations are learned already, and stay
 
     def scaled_by(self, factors: np.ndarray) -> Prior:
         """Return the prior with standard deviations times factors (P,), which then stay."""
-        return replace(self, covariance=self.covariance * np.outer(factors, factors), groups=None)
+        return replace(self, covariance=self.covariance * np.outer(factors, factors), learned=True)
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,11 @@ class Weights:
     def predict(self, features: np.ndarray) -> np.ndarray:
         """Return the mean (n, o) for features (n, o, p)."""
         return _forward(features, self.mean, self.prior)
+
+    def with_others(self, q: int) -> Weights:
+        """Return a start for a prior with q more weights (`with_others`), which are 0."""
+        at = [self.n_weights] * q
+        return replace(self, mean=np.insert(self.mean, at, 0.0), factors=np.insert(self.factors, at, 1.0))
 
     def given(self, first: np.ndarray) -> Weights:
         """Return the posterior with the first weights set, and the others at their conditional mean."""
@@ -175,16 +181,30 @@ class Known(NamedTuple):
     targets: np.ndarray  # (p + 1, o)
 
 
-def condensed(rows: Rows, weights: Weights) -> Known:
+def condensed(rows: Rows, weights: Weights, effects: np.ndarray | None = None) -> Known:
     """Condense rows to the triangular factor of the whitened [H y] of each output."""
+    # effects (n, o, k) are columns whose weights are N(0, I), independent for each output and each move (``groups``).
+    # They are integrated out: the QR factorisation of [E H y; I 0 0] leaves, below the rows of E, the factor of the
+    # marginal likelihood.
     _, n_outputs, p = rows.features.shape
     scale = np.sqrt(weights.inflation * weights.correlation_time * _variances(weights.noise, rows.speed))
     features, targets = np.zeros((p + 1, n_outputs, p)), np.zeros((p + 1, n_outputs))
+    moves = [rows.groups == move for move in np.unique(rows.groups)]
     for o in range(n_outputs):
         whole = np.column_stack([rows.features[:, o], rows.targets[:, o]]) / scale[:, o : o + 1]
+        if effects is not None:
+            own = effects[:, o] / scale[:, o : o + 1]
+            whole = np.concatenate([_without(own[move], whole[move]) for move in moves])
         factor = np.asarray(np.linalg.qr(whole, mode="r"))
         features[: len(factor), o], targets[: len(factor), o] = factor[:, :p], factor[:, p]
     return Known(features, targets)
+
+
+def _without(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return fewer rows with the likelihood of rows (n, m) with unit noise after columns (n, k) are integrated out."""
+    k = columns.shape[1]
+    whole = np.block([[columns, rows], [np.eye(k), np.zeros((k, rows.shape[1]))]])
+    return np.asarray(np.linalg.qr(whole, mode="r"))[k:, k:]
 
 
 @dataclass(frozen=True)
@@ -248,17 +268,23 @@ class _Problem:
     def _next_factors(self, state: _State, squares: np.ndarray) -> np.ndarray:
         """Return the factors (P,) after a step of expectation maximisation, given E[z²] (P,)."""
         factors = state.factors.copy()
-        if self.prior.groups is None:
+        if self.prior.groups is None or self.prior.learned:
             return factors
+        p = len(self.prior.scaled)
+        unknown_gains = len(self.prior.mean) > p
         for group in dict.fromkeys(self.prior.groups):
             if group:
                 own = self.prior.groups == group
                 n, total = own.sum(), squares[own].sum() * factors[own][0] ** 2
+                # With unknown gains, torques do not show the scale of all masses. Small errors of what they do show
+                # must not make that scale certain, and gains with it.
+                scaled = unknown_gains and self.prior.scaled[own[:p]].any()
+                least = 0.0 if scaled else -_WIDEST
                 # -n + total / t² - log t falls with log t. It is 0 at the best t, or beyond the limits of t.
-                low, high = (total * np.exp(-2.0 * edge) - n - edge for edge in (-_WIDEST, _WIDEST))
-                best = -_WIDEST if low <= 0.0 else _WIDEST
+                low, high = (total * np.exp(-2.0 * edge) - n - edge for edge in (least, _WIDEST))
+                best = least if low <= 0.0 else _WIDEST
                 if low > 0.0 > high:
-                    best = brentq(lambda log: total * np.exp(-2.0 * log) - n - log, -_WIDEST, _WIDEST)  # noqa: B023
+                    best = brentq(lambda log: total * np.exp(-2.0 * log) - n - log, least, _WIDEST)  # noqa: B023
                 factors[own] = np.exp(best)
         return factors
 
@@ -298,6 +324,22 @@ def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:
     covariance[-n_outputs:, -n_outputs:] = scale**2 * np.eye(n_outputs)
     groups = None if prior.groups is None else np.concatenate([prior.groups, [""] * n_outputs])
     return replace(prior, mean=mean, covariance=covariance, groups=groups)
+
+
+def with_others(prior: Prior, variances: np.ndarray, *, scaled: bool = False) -> Prior:
+    """Add independent weights with mean 0 between the weights and the gains."""
+    p, q = len(prior.scaled), len(variances)
+    kept = np.concatenate([np.arange(p), np.arange(p + q, len(prior.mean) + q)])
+    covariance = np.zeros((len(prior.mean) + q, len(prior.mean) + q))
+    covariance[np.ix_(kept, kept)] = prior.covariance
+    covariance[range(p, p + q), range(p, p + q)] = variances
+    return replace(
+        prior,
+        mean=np.insert(prior.mean, [p] * q, 0.0),
+        covariance=covariance,
+        scaled=np.append(prior.scaled, np.full(q, scaled)),
+        groups=None if prior.groups is None else np.insert(prior.groups, [p] * q, ""),
+    )
 
 
 def _forward(features: np.ndarray, mean: np.ndarray, prior: Prior) -> np.ndarray:

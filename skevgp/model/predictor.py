@@ -151,6 +151,12 @@ class PredictorGroup:
         own_root[:, :, m:] = own_root[:, :, m:] @ prior.roots().transpose(0, 2, 1)
         return cls(outputs, kernel, hyperparameters, points, whitening, signal, own_mean, own_root, leak)
 
+    def weight_roots(self) -> np.ndarray:
+        """Roots (o, k, p) of the covariance of the weights. They are those of the best fit if f is orthogonal."""
+        m = len(self.points)
+        found = self.root[:, :, m:]
+        return found if self.leak is None else found + np.einsum("okm,opm->okp", self.root[:, :, :m], self.leak)
+
 
 class Projected(NamedTuple):
     """Rows as a group of outputs sees them."""
@@ -178,6 +184,33 @@ class Predictor:
     intercept: np.ndarray
     # Whether outputs share their weights and are therefore correlated.
     shared: bool
+    # Number of parameters θ of the features that outputs with own weights share. The last rows of all roots are theirs.
+    n_theta: int = 0
+
+    @property
+    def n_common(self) -> int:
+        """Number of rows at the end of the roots that belong to the same numbers for all outputs."""
+        return self.offset.shape[1] if self.shared else self.n_theta
+
+    def with_theta(self, K: np.ndarray) -> Predictor:
+        """The predictor whose outputs are correlated by the z - ẑ of `model.weights`, given K (o, d, q) of each output.
+
+        It is the same predictor if outputs share their weights, or if those of an output do not determine z.
+        """
+        o, d, q = K.shape
+        if o == 1 or self.shared or min(map(np.linalg.matrix_rank, K)) < q:
+            return self
+        # The weights of the last d columns are K (z - ẑ), so that z - ẑ is K⁺ times them, and has the root Δ (k, q).
+        # With Δ = Q R, the last q rows of a rotated root can be those of z, and R is the same for all outputs.
+        groups = []
+        for group in self.groups:
+            roots, of_weights = [], group.weight_roots()[:, :, -d:]
+            for root, weights, own in zip(group.root, of_weights, K[group.outputs], strict=True):
+                Q, R = np.linalg.qr(weights @ np.linalg.pinv(own).T, mode="complete")
+                signs = np.where(np.diagonal(R) < 0.0, -1.0, 1.0)
+                roots.append(np.concatenate([Q[:, q:], Q[:, :q] * signs], axis=1).T @ root)
+            groups.append(replace(group, root=np.array(roots)))
+        return replace(self, groups=tuple(groups), n_theta=q)
 
     @classmethod
     def joined(
@@ -315,14 +348,14 @@ class Predictor:
         return self.in_order(parts).T
 
     def common(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """M (k, n, o), where M_iᵀ M_j is the covariance of outputs i and j. Without shared weights, k is 0."""
+        """M (k, n, o), where M_iᵀ M_j is the covariance of outputs i and j. If they share nothing, k is 0."""
         return self._common(self.projected(inputs, features)).transpose(1, 2, 0)
 
     def _common(self, projected: Iterable[Projected]) -> np.ndarray:
         """M of `common` as (o, k, n), for rows as each group sees them."""
         # With B⁻¹ = RᵀR and R = root_inv of `bounds`, M consists of the rows of w. The other parts of outputs are
         # independent.
-        p = self.offset.shape[1] if self.shared else 0
+        p = self.n_common
         return self.in_order(
             group.root[:, group.root.shape[1] - p :] @ own.P for group, own in zip(self.groups, projected, strict=True)
         )
@@ -356,10 +389,9 @@ class Predictor:
         covariance = np.empty((o, p, p))
         for group in self.groups:
             m = len(group.points)
-            own, deviation = group.mean[:, m:], group.root[:, :, m:]
+            own, deviation = group.mean[:, m:], group.weight_roots()
             if group.leak is not None:
                 own = own + np.einsum("opm,om->op", group.leak, group.mean[:, :m])
-                deviation = deviation + np.einsum("okm,opm->okp", group.root[:, :, :m], group.leak)
             mean[group.outputs] += own
             covariance[group.outputs] = deviation.transpose(0, 2, 1) @ deviation
         return mean, covariance

@@ -154,6 +154,11 @@ class Deviation:
         return found
 
     @property
+    def root(self) -> np.ndarray:
+        """The symmetric root (q, q) of the covariance."""
+        return (self.W * self.widths) @ self.W.T
+
+    @property
     def covariance(self) -> np.ndarray:
         """The covariance (q, q)."""
         L = self.W * self.widths

@@ -81,6 +81,9 @@ def test_pages_of_several_csvs_have_their_numbers(script):
     found["splits"] = peers.tables_of(frame(RESULTS / "splits.csv"), curves[:0])
     arms = (frame(RESULTS / f"real_arms{end}.csv", size="full") for end in ("", "_parameters"))
     found["real_arms"] = robots.real_tables(*arms)
+    found["payload"] = robots.payload_tables(
+        *(frame(RESULTS / f"payload{end}.csv", size="full") for end in ("_real", ""))
+    )
     for page, own in found.items():
         text = (RESULTS / f"{page}.md").read_text()
         assert filled(text, own) == text, page

@@ -113,6 +113,7 @@ SMOKE = [
     smoke("tables", "inducing --sets toy-200"),
     smoke("robustness"),
     smoke("robots", "identification"),
+    smoke("robots", "payload"),
 ]
 
 

@@ -71,6 +71,24 @@ def test_each_source_file_that_a_page_names_is_there():
 
 # What the prose says was measured, and the line of the results that it is from.
 FIGURES = [
+    (
+        "guide/parameters.md",
+        "in 95 % and 94 % of 100",
+        "parameters_misfit",
+        r"line \| 100 \| orth.* 0\.950",
+    ),
+    (
+        "guide/parameters.md",
+        "in 95 % and 94 % of 100",
+        "parameters_misfit",
+        r"decay \| 100 \| orth.* 0\.940",
+    ),
+    (
+        "guide/parameters.md",
+        "they cover it in 91 %",
+        "parameters_misfit",
+        r"decay \| 30 \| orth.* 0\.910",
+    ),
     ("guide/control.md", "take 23 µs by `compile()`", "latency", r"compiled: row, mean and std \| 23 "),
     ("guide/control.md", "49 µs by `predict`", "latency", r"predict: row, mean and std \| 49 "),
     ("guide/solvers.md", "they had 99.0 %", "many_rows", r"adam 40 .* 98 \| .* 99\.02 %"),

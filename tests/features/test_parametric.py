@@ -146,7 +146,7 @@ def test_copies_keep_values_and_clones_forget_them():
             wave,
             {**PRIORS, "frequency": Normal(0, 1)},
             ValueError,
-            r"no parameters \['frequency'\]; it has \['per",
+            r"no parameters \['frequency'\]; those that can be passed by name are \['per",
         ),
         (wave, {}, ValueError, "parameters is empty"),
         (lambda X, a: anp.log(a) * X, {"a": Normal(1.0, 0.5)}, ValueError, "with a=-0.5, returned NaN"),
@@ -171,5 +171,5 @@ def test_errors_name_parameter_and_value(function, parameters, error, message):
 
 
 def test_unit_of_unknown_parameter_raises():
-    with pytest.raises(ValueError, match=r"no parameters \['length'\]"):
+    with pytest.raises(ValueError, match=r"names \['length'\], which are no parameters"):
         ParametricFeatures(wave, PRIORS, units={"length": "m"}).fit(X)

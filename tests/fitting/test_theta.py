@@ -12,7 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, feature_report
 from skevgp.exceptions import UnidentifiedWarning
 from skevgp.features import LogNormal, Normal, ParametricFeatures, Uniform
 from skevgp.fitting.theta import map_at
@@ -104,6 +104,9 @@ def test_parameters_of_a_linear_function_are_weights(exact, n_outputs, weighted,
     assert_allclose(model.coef_, np.ones(model.coef_.shape))
     for one, other in zip(model.predict(X_NEW, return_std=True), expected.predict(X_NEW, return_std=True), strict=True):
         assert_allclose(one, other, rtol=1e-6, atol=1e-8)
+    # Outputs that share θ are correlated, as those that share weights.
+    joint = [one.predict(X_NEW[:4], return_cov="joint")[1] for one in (model, expected)]
+    assert_allclose(*joint, rtol=1e-5, atol=1e-7)
     if discrepancy == "free":
         # The weights of an orthogonal f are those of the best fit.
         assert_allclose(list(model.theta_.values()), expected.coef_, rtol=1e-6)
@@ -233,6 +236,30 @@ def test_partial_fit_of_a_curved_function_is_a_newton_step(n_outputs):
     model = sparse(**options).fit(X[first], y[first]).partial_fit(X[~first], y[~first])
     assert_same_theta(model, whole, 0.2)
     assert_allclose(model.predict(X_NEW), whole.predict(X_NEW), atol=0.05)
+
+
+def test_warm_start_goes_on_from_the_last_parameters():
+    model = sparse(WAVE, warm_start=True).fit(X, Y[:, 0])
+    n_iter, theta = model.n_iter_, dict(model.theta_)
+    model.fit(X, Y[:, 0])
+    assert model.n_iter_ < n_iter
+    assert model.theta_ == pytest.approx(theta, rel=1e-2)
+
+
+@pytest.mark.parametrize("make", [sparse, EGPRegressor])
+def test_parameters_do_not_move_under_a_guess_of_the_noise(make):
+    """Without a fit of kernel and noise, θ is the best for the features alone."""
+    options = {"optimizer": None} if make is EGPRegressor else {"max_iter": 0}
+    model, whole = make(WAVE, **options).fit(X, Y[:, 0]), make(WAVE).fit(X, Y[:, 0])
+    for name, value in whole.theta_.items():
+        assert model.theta_[name] == pytest.approx(value, abs=5.0 * whole.theta_std_[name] + 0.02)
+
+
+@pytest.mark.parametrize("make", [sparse, EGPRegressor])
+def test_report_on_features_with_parameters(make):
+    model = make(WAVE).fit(X, Y[:, 0])
+    (group, everything) = feature_report(model, X, Y[:, 0], n_splits=2).groups
+    assert everything.n_weights == group.n_weights == model.coef_.shape[-1]
 
 
 # --- combinations ----------------------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from skevgp.identification.stiction import JointNoise, likeliest_noise, likeliest_velocity, noise_at
+from skevgp.identification.stiction import JointNoise, MeanFriction, likeliest_noise, noise_at
 
 
 def drawn(n=20_000, seed=0, noise=0.1, coulomb=2.0, velocity=0.02):
@@ -36,15 +37,14 @@ def test_noise_of_few_rows_that_move_is_larger_than_the_mean_square_of_all(coulo
     assert noise_at(errors, speed, coulomb, 0.01, 1e-9).variance > np.mean(errors**2)
 
 
-@pytest.mark.parametrize("velocity", [0.005, 0.03, 0.1])
-def test_velocity_of_mean_friction_is_found_from_what_another_one_leaves(velocity):
-    rng = np.random.default_rng(0)
-    speed = 0.3 * rng.normal(size=5000)
-    torque = 2.0 * np.tanh(speed / velocity) + 0.5 * speed + 0.1 * rng.normal(size=5000)
-    terms = np.column_stack([np.tanh(speed / 0.015), speed])
-    coulomb, viscous = np.linalg.lstsq(terms, torque, rcond=None)[0]
-    left = torque - terms @ [coulomb, viscous]
-    found = likeliest_velocity(left, speed, coulomb, 0.015, 1.0, 1e-9)
-    assert found == pytest.approx(velocity, rel=0.5)
-    # Of rows that say hardly anything it is the usual one.
-    assert likeliest_velocity(left, speed, coulomb, 0.015, 1e9, 1e-9) == pytest.approx(0.015)
+def test_slopes_of_mean_friction_are_those_of_differences():
+    speed = 0.05 * np.random.default_rng(0).normal(size=(50, 2))
+    friction, step = MeanFriction(np.array([2.0, -3.0]), np.array([0.5, -1.0])), 1e-5
+
+    def torque(z):
+        return friction.coulomb * np.tanh(speed / MeanFriction(friction.coulomb, z).velocity)
+
+    for joint in range(2):
+        moved = step * np.eye(2)[joint]
+        expected = (torque(friction.z + moved) - torque(friction.z - moved)) / (2.0 * step)
+        assert_allclose(friction.slopes(speed)[:, :, joint], expected, atol=1e-8)

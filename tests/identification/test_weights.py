@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import DotProduct
 
-from skevgp.identification.weights import Prior, Rows, condensed, folds, identify, with_gains
+from skevgp.identification.weights import Prior, Rows, condensed, folds, identify, with_gains, with_others
 
 
 def problem(n=400, n_outputs=2, p=4, noise=0.1, seed=0, gains=None, scaled=4):
@@ -100,3 +100,53 @@ def test_rows_left_out_are_predicted_from_the_others():
     alone = replace(rows, blocks=np.zeros(len(targets), dtype=int))
     (whole,) = folds(alone, identify(alone, prior))
     assert np.isfinite(whole.torques).all()
+
+
+def test_unknown_gains_keep_the_prior_of_masses():
+    rows, prior, beta = problem(n=600, gains=np.array([1.1, 0.9]))
+    prior = replace(prior, mean=beta, covariance=np.eye(4), groups=np.array(["inertia"] * 4, dtype=object))
+    # Weights are the prior mean: with known gains the learned scale is small.
+    known = identify(replace(rows, targets=rows.features @ beta + 0.1), prior)
+    unknown = identify(rows, with_gains(prior, 2, 0.2))
+    assert known.factors.max() < 0.5
+    assert_allclose(unknown.factors, 1.0)
+
+
+def test_more_weights_change_nothing_where_their_columns_are_zero():
+    rows, prior, _ = problem(gains=np.array([1.1, 0.9]))
+    prior = with_gains(prior, 2, 0.2)
+    found = identify(rows, prior)
+    wider = replace(rows, features=np.concatenate([rows.features, np.zeros((400, 2, 3))], axis=2))
+    with_three = identify(wider, with_others(prior, np.full(3, 4.0)))
+    kept = [0, 1, 2, 3, 7, 8]
+    assert_allclose(with_three.mean[kept], found.mean, rtol=1e-6)
+    assert_allclose(with_three.covariance[np.ix_(kept, kept)], found.covariance, rtol=1e-5, atol=1e-12)
+    assert_allclose(np.diag(with_three.covariance)[4:7], 4.0)
+
+
+def test_surprise_is_that_of_the_prior_as_given_after_more_rounds():
+    rows, prior, beta = problem()
+    prior = replace(prior, mean=beta + np.array([5.0, 0.0, 0.0, 0.1]), covariance=np.diag([1.0, 1.0, 4.0, 1.0]))
+    prior = replace(prior, groups=np.array(["a", "a", "b", "a"], dtype=object))
+    first = identify(rows, prior)
+    again = identify(rows, first.prior, start=first)
+    assert again.surprise == pytest.approx(first.surprise, rel=0.02)
+
+
+def test_effects_of_moves_are_integrated_out():
+    rows, prior, beta = problem(n=60, n_outputs=1)
+    weights = identify(rows, prior)
+    effects = np.random.default_rng(1).normal(size=(60, 1, 2))
+    known = condensed(rows, weights, effects)
+    scale = weights.inflation * weights.correlation_time[0] * weights.noise[0].variance
+    covariance = scale * np.eye(60)
+    for move in np.unique(rows.groups):
+        own = rows.groups == move
+        covariance[np.ix_(own, own)] += effects[own, 0] @ effects[own, 0].T
+
+    def square(some):
+        error = rows.targets[:, 0] - rows.features[:, 0] @ some
+        return error @ np.linalg.solve(covariance, error)
+
+    for some in (beta, beta + 0.3):
+        assert np.sum((known.targets - known.features @ some) ** 2) == pytest.approx(square(some), rel=1e-8)
