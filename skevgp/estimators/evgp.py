@@ -96,7 +96,7 @@ class EVGPRegressor(GaussianProcess):
     warm_start : bool, default=False
         Whether to start from the result of the last fit.
     n_jobs : int, default=None
-        Number of threads. If None, 1; if -1, all cores. The result does not depend on it.
+        Number of threads. If None, 1; if -1, all cores.
     random_state : int, RandomState instance or None, default=None
         Seed of inducing points, mini-batches and restarts.
     verbose : int, default=0
@@ -123,8 +123,7 @@ class EVGPRegressor(GaussianProcess):
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     inducing_points_ : ndarray of shape (m, d) or, for several outputs unless all share them, (n_outputs, m, d)
-        Inducing points in the space of ``kernel_map``. They are a list of arrays if outputs have different numbers of
-        points.
+        Inducing points in the space of ``kernel_map``.
     sharing_ : list of list of int
         Groups of outputs that share a kernel.
     kernel_ : Kernel, or list of Kernel for several outputs
@@ -135,10 +134,10 @@ class EVGPRegressor(GaussianProcess):
         Factor on the precision of each row: 1 for ordinary rows, and near 0 for outliers. It exists only with
         ``noise="student-t"``.
     lower_bound_, upper_bound_ : float
-        Bounds on the log marginal likelihood at the fitted parameters, in nats, summed over outputs. If they agree,
-        more inducing points cannot improve the fit.
+        Bounds on the log marginal likelihood in nats, summed over outputs. If they agree, more inducing points cannot
+        improve the fit.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the lower bound per iteration, plus minus the log prior density of learned scales of weights.
+        Minus the lower bound per iteration.
     n_iter_ : int
         Number of iterations of the best start.
     n_parameters_ : int

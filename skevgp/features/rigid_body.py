@@ -81,8 +81,8 @@ class RigidBodyRegressor(ParametricMap):
 
     Notes
     -----
-    The size of a link is the largest of three lengths: the distances from its joint to the next joint and to its centre
-    of mass, and its radius of gyration.
+    The size of a link is the largest of three lengths: its radius of gyration, and the distances from its joint to the
+    next joint and to its centre of mass.
 
     X has the columns [q, q̇, q̈], such as those of `skevgp.datasets.load_log`. Do not scale them before this map.
 
