@@ -14,10 +14,10 @@ _filters = RLock()
 
 
 class DependentRowsWarning(UserWarning):
-    """Neighbouring rows are similar, but ``groups`` were not given.
+    """Warning that neighbouring rows are similar, but ``groups`` were not given.
 
-    `EVGPRegressor.fit` gives this warning. Its standard deviations are then valid for rows near the training rows, but
-    not for new trajectories.
+    `EVGPRegressor.fit` gives it. The standard deviations are then valid for rows near the training rows, but not for
+    new trajectories.
 
     See Also
     --------
@@ -35,10 +35,10 @@ class DependentRowsWarning(UserWarning):
 
 
 class InconsistentVersionWarning(UserWarning):
-    """A model was saved with another version, and may predict something else.
+    """Warning that a model was saved with another version, and may predict other values.
 
-    It is given for pickles, and files of `skops.io.dump`, of another version of skevgp. `skevgp.io.load` gives it for
-    models of another version of scikit-learn whose predictions cannot be compared.
+    Loading a pickle, or a file of `skops.io.dump`, of another version of skevgp gives it. `skevgp.io.load` gives it if
+    scikit-learn has another version, and predictions cannot be compared.
 
     See Also
     --------
@@ -56,11 +56,11 @@ class InconsistentVersionWarning(UserWarning):
 
 
 class RobotModelWarning(UserWarning):
-    """The file, the model or a log of a robot has unphysical numbers.
+    """Warning that the file, the model or a log of a robot has unphysical numbers.
 
-    `skevgp.datasets.load_robot`, and everything that loads a robot, gives it for moments of inertia that violate the
-    triangle inequality, and for numbers of a URDF file that are not used, such as a negative effort limit.
-    `skevgp.datasets.load_log` gives it for efforts that lag behind positions, if it estimates their delay.
+    `skevgp.datasets.load_robot` gives it for moments of inertia that violate the triangle inequality. It also gives it
+    for numbers of a URDF file that are not used, such as a negative effort limit. Every function that loads a robot
+    does the same. `skevgp.datasets.load_log` gives the warning if it finds that efforts lag behind positions.
 
     See Also
     --------
@@ -76,9 +76,9 @@ class RobotModelWarning(UserWarning):
 
 
 class UnidentifiedWarning(UserWarning):
-    """The data do not identify a parameter of the feature map: its posterior is its prior.
+    """Warning that the data do not identify a parameter of the feature map.
 
-    `EVGPRegressor.fit` and `EGPRegressor.fit` give it.
+    The posterior of the parameter is its prior. `EVGPRegressor.fit` and `EGPRegressor.fit` give this warning.
 
     See Also
     --------

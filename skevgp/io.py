@@ -101,19 +101,19 @@ functions and transformers are not in the list; ``skops.io.get_untrusted_types(f
 
 
 def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> None:
-    """Write a fitted model to a file from which loading runs no code.
+    """Write a fitted model to a file that loads without running code.
 
-    A loaded model predicts exactly the same, and can go on with ``partial_fit``. The data are loaded once as a test
-    before they are written. If anything fails, the old file is still there.
+    A loaded model predicts exactly the same values, and can continue with ``partial_fit``. Before the file is written,
+    it is loaded once as a test. If anything fails, an existing file stays as it is.
 
     Parameters
     ----------
     model : estimator
-        A fitted regressor or transformer of skevgp, or a scikit-learn estimator that contains one.
+        Fitted regressor or transformer of skevgp, or a scikit-learn estimator that contains one.
     path : str or path-like
         File to write, for example ``"arm.skevgp"``. An existing file is replaced.
     trusted : sequence of str, default=()
-        Names of further types in the model, such as your own transformers: ``["my_package.MyMap"]``. `load` needs the
+        Names of further types in the model, such as ``["my_package.MyMap"]`` for your own transformer. `load` needs the
         same list.
 
     Raises
@@ -121,7 +121,7 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
     ImportError
         If skops is not installed.
     ValueError
-        If the model holds other types, which the message names, or could not be loaded again.
+        If the model contains other types, which the message names, or cannot be loaded again.
     sklearn.exceptions.NotFittedError
         If the model is not fitted.
     OSError
@@ -133,9 +133,9 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
 
     Notes
     -----
-    A named system is stored as its name, and any other robot as numbers. Its URDF file and example-robot-data are not
-    needed to load the model. A path that was given as ``robot`` stays in the parameters as text, and is used by another
-    ``fit`` or by `InverseDynamics.write_urdf` only.
+    A named system is stored as its name, and any other robot as numbers. Loading the model needs neither its URDF file
+    nor example-robot-data. A path that was given as ``robot`` is stored as text. Only another ``fit`` and
+    `InverseDynamics.write_urdf` use it.
 
     Examples
     --------
@@ -170,16 +170,16 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
 def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
     """Read a model from a file that `save` has written.
 
-    Only types in `TRUSTED_TYPES`, in ``trusted``, and those that skops trusts are created. No code of the file is run,
-    so that files from unknown sources are safe to load. The model must predict the same for a few rows as when it was
-    saved.
+    Files from unknown sources are safe to load, because no code of the file is run. Only types in `TRUSTED_TYPES` and
+    in ``trusted``, and types that skops trusts, are created. The model must predict the same for a few rows as when it
+    was saved.
 
     Parameters
     ----------
     path : str or path-like
         File to read.
     trusted : sequence of str, default=()
-        Names of further types to trust, such as your own transformers: ``["my_package.MyMap"]``.
+        Names of further types to trust, such as ``["my_package.MyMap"]`` for your own transformer.
 
     Returns
     -------
@@ -189,8 +189,8 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
     Raises
     ------
     ValueError
-        If the file is damaged, was not written by `save`, has another format or needs other types, or if the model
-        predicts something else than before, which may happen with another version of scikit-learn.
+        If the file is damaged, was not written by `save`, has another format, or needs other types. If the model
+        predicts other values than before, which may happen with another version of scikit-learn.
     ImportError
         If skops, Pinocchio or a package of data frames is needed and not installed.
     OSError
@@ -230,8 +230,8 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
         raise ValueError(f"{os.fspath(path)!r} cannot be loaded: {_said(error)}.") from error
     if not tried and made_with.get("scikit-learn") != sklearn.__version__:
         warn_user(
-            f"{os.fspath(path)!r} was saved with {_told(made_with)} (here: {_told(_about())}). What the model predicts "
-            "could not be compared.",
+            f"{os.fspath(path)!r} was saved with {_told(made_with)} (here: {_told(_about())}). Its predictions could "
+            "not be compared.",
             InconsistentVersionWarning,
         )
     return model
@@ -266,7 +266,7 @@ def _made(data: bytes, trusted: list[str]) -> tuple[Any, bool]:
     skops = require("skops.io", "Loading a model")
     if unknown := sorted(set(skops.get_untrusted_types(data=data)) - set(trusted)):
         raise ValueError(
-            f"it holds {', '.join(unknown[:20])}, not a type to trust by default. If you trust its code, name it in "
+            f"it holds {', '.join(unknown[:20])}, which is not trusted by default. If you trust its code, name it in "
             "trusted=[...]"
         )
     content = skops.loads(data, trusted=trusted)
@@ -356,7 +356,7 @@ def _compare(model: Any, trial: Any) -> None:
     of_std = allowed + _OF_LARGEST * np.abs(expected).max(axis=0, initial=0.0)
     near = (np.abs(mean - expected) <= allowed) & (np.abs(std - expected_std) <= of_std)
     if not (near & np.isfinite(allowed)).all():
-        raise ValueError("its model predicts something else than when it was saved")
+        raise ValueError("its model predicts other values than when it was saved")
 
 
 def _about() -> dict[str, Any]:

@@ -51,7 +51,7 @@ def _positive(std: np.ndarray, name: str) -> np.ndarray:
 
 
 def prediction_error(y_true: ArrayLike, y_pred: ArrayLike) -> float:
-    """Mean over rows of the Euclidean norm of the error ("Error" in the paper).
+    """Return the mean over rows of the Euclidean norm of the error ("Error" in the paper).
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def prediction_error(y_true: ArrayLike, y_pred: ArrayLike) -> float:
     Returns
     -------
     error : float
-        The error in units of y.
+        Error in units of y.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def prediction_error(y_true: ArrayLike, y_pred: ArrayLike) -> float:
 
 
 def std_norm(std: ArrayLike) -> float:
-    """Mean over rows of the Euclidean norm of the predicted standard deviation (‖STD‖ in the paper).
+    """Return the mean over rows of the Euclidean norm of the predicted std (‖STD‖ in the paper).
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def std_norm(std: ArrayLike) -> float:
     Returns
     -------
     norm : float
-        The norm in units of y.
+        Norm in units of y.
 
     Raises
     ------
@@ -108,9 +108,9 @@ def std_norm(std: ArrayLike) -> float:
 def containing_ratios(
     y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike, k: Sequence[float] | float = (1, 2, 3)
 ) -> np.ndarray:
-    """Share of the values within k predicted standard deviations (CR-k in the paper).
+    """Return the share of the values within k predicted standard deviations (CR-k in the paper).
 
-    For Gaussian errors with a correct standard deviation it tends to 0.683, 0.954 and 0.997 at k = 1, 2, 3.
+    For Gaussian errors with a correct standard deviation, the share tends to 0.683, 0.954 and 0.997 at k = 1, 2, 3.
 
     Parameters
     ----------
@@ -144,7 +144,9 @@ def containing_ratios(
 
 
 def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
-    """Mean over rows of -log N(y | mean, std²), summed over outputs: a proper score, lower is better.
+    """Return the mean over rows of -log N(y | mean, std²), summed over outputs.
+
+    It is a proper score, and lower is better.
 
     Parameters
     ----------
@@ -154,7 +156,7 @@ def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: A
     Returns
     -------
     nlpd : float
-        The score in nats per row.
+        Score in nats per row.
 
     Raises
     ------
@@ -175,14 +177,14 @@ def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: A
 
 
 def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
-    r"""Mean over rows of the continuous ranked probability score of N(mean, std²), summed over outputs.
+    r"""Return the continuous ranked probability score of N(mean, std²): mean over rows, summed over outputs.
 
     It is a proper score, and lower is better. Compared with `negative_log_predictive_density`, it is in units of y and
-    less sensitive to outliers. With z = (y - mean) / std it is (Gneiting & Raftery 2007, section 4.2)
+    less sensitive to outliers. With z = (y - mean) / std, the score is (Gneiting & Raftery 2007, section 4.2)
 
-    .. math:: \int (F(x) - 1_{x \geq y})^2 dx = \sigma \, [z (2 \Phi(z) - 1) + 2 \varphi(z) - 1 / \sqrt{\pi}],
+    .. math:: \int (F(x) - 1_{x \geq y})^2 dx = \sigma \, [z (2 \Phi(z) - 1) + 2 \varphi(z) - 1 / \sqrt{\pi}].
 
-    and the absolute error if the standard deviation is 0.
+    It is the absolute error if the standard deviation is 0.
 
     Parameters
     ----------
@@ -192,7 +194,7 @@ def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
     Returns
     -------
     score : float
-        The score in units of y, at least 0.
+        Score in units of y, at least 0.
 
     Raises
     ------
@@ -219,17 +221,16 @@ def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
 
 
 def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
-    r"""Mean absolute difference between the coverage of central intervals and their probability.
+    r"""Return the mean absolute difference between the coverage of central intervals and their probability.
 
-    With :math:`\hat c(p)` the share of all (row, output) pairs inside the central interval of probability p of
-    N(mean, std²), it is the area between the reliability curve and the diagonal,
+    Let :math:`\hat c(p)` be the share of values inside the central interval of probability p of N(mean, std²). The
+    error is the area between this reliability curve and the diagonal,
 
     .. math:: \int_0^1 |\hat c(p) - p| \, dp.
 
-    The integral is exact, without bins. It is the calibration error of Kuleshov et al. (2018, eq. 9) with absolute
-    differences and central intervals (the "mean absolute calibration error" of Tran et al. 2020). The best value is 0
-    and the worst 0.5. For n independent calibrated values it is about 0.3 / sqrt(n). It is not a proper score:
-    uninformative wide intervals can be calibrated too. Use it together with `crps`.
+    The integral is exact, without bins. Tran et al. (2020) call it the mean absolute calibration error. The best value
+    is 0, and the worst is 0.5. For n independent calibrated values it is about 0.3 / sqrt(n). Wide intervals without
+    information can be calibrated too, so use it together with a proper score such as `crps`.
 
     Parameters
     ----------
@@ -239,7 +240,7 @@ def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> f
     Returns
     -------
     error : float
-        The calibration error, from 0 to 0.5.
+        Calibration error, from 0 to 0.5.
 
     Raises
     ------
@@ -272,7 +273,7 @@ def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> f
 
 
 def interval_levels(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> np.ndarray:
-    """Probability of the smallest central interval of N(mean, std²) that contains y, for each value.
+    """Return the probability of the smallest central interval of N(mean, std²) that contains y, for each value.
 
     Parameters
     ----------

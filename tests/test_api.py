@@ -132,5 +132,5 @@ def test_model_from_a_skops_file_is_the_model(model, used):
 @pytest.mark.parametrize("estimator", [EVGPRegressor, EGPRegressor])
 def test_kernel_as_the_first_argument_is_sent_to_kernel(estimator):
     # As in scikit-learn's GaussianProcessRegressor, whose first argument it is.
-    with pytest.raises(TypeError, match=r"feature_map=RBF\(length_scale=2\) is a kernel: give it as kernel="):
+    with pytest.raises(TypeError, match=r"feature_map=RBF\(length_scale=2\) is a kernel. Pass it as kernel="):
         estimator(RBF(2.0)).fit(X, Y)

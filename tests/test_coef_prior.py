@@ -325,5 +325,5 @@ def test_map_may_know_groups_only():
 def test_no_label_is_none_and_others_are_words():
     found = resolve(LabelledOnly(), groups=np.array(["a", None, ""], dtype=object))
     assert found.groups.tolist() == [["a", "", ""]] * 2
-    with pytest.raises(ValueError, match="groups of CoefPrior must be words"):
+    with pytest.raises(ValueError, match="groups of CoefPrior must be strings"):
         resolve(LabelledOnly(), groups=[1.0, 2.0, np.nan])

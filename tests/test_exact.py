@@ -159,7 +159,7 @@ def test_noise_starts_in_one_place():
 
 
 def test_dask_arrays_raise():
-    with pytest.raises(TypeError, match="use EVGPRegressor"):
+    with pytest.raises(TypeError, match="Use EVGPRegressor"):
         EGPRegressor().fit(da.from_array(X), Y)
 
 

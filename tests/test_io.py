@@ -279,7 +279,7 @@ def test_changed_predictions_raise(path):
     content = content_of(path)
     content["trial"]["mean"] = content["trial"]["mean"] + 1.0
     write_content(path, content)
-    with pytest.raises(ValueError, match=r"model.skevgp' .*predicts something else than when it was saved\.$"):
+    with pytest.raises(ValueError, match=r"model.skevgp' .*predicts other values than when it was saved\.$"):
         load(path)
     write_content(path, content, skevgp="0.2.7", numpy="1.0")
     with pytest.raises(ValueError, match=r"saved with skevgp 0\.2\.7, scikit-learn .*, numpy 1\.0, .*here: skevgp"):

@@ -102,7 +102,7 @@ def test_with_alpha_and_no_optimizer_it_is_scikit_learns_model(y, alpha):
 
 @pytest.mark.parametrize("arguments", [{"noise": Gaussian(variance=0.1)}, {"kernel": RBF() + WhiteKernel()}], ids=str)
 def test_noise_is_known_or_learned(arguments):
-    with pytest.raises(ValueError, match=r"alpha=0\.1 is the noise"):
+    with pytest.raises(ValueError, match=r"alpha=0\.1 fixes the noise"):
         EGPRegressor(alpha=0.1, **arguments).fit(X, Y)
 
 

@@ -52,7 +52,7 @@ def test_part_of_the_fit_ends_with_its_share_of_the_time_and_the_others_go_on():
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_when_it_is_over_the_best_so_far_is_kept(sharing, n_jobs):
     model = EVGPRegressor(n_inducing=10, sharing=sharing, solver=LBFGS(max_time=1e-9), n_jobs=n_jobs, random_state=0)
-    with pytest.warns(ConvergenceWarning, match=r"ended since max_time=1e-09 seconds were over, after 1 iterations"):
+    with pytest.warns(ConvergenceWarning, match=r"ended at max_time=1e-09 seconds after 1 iterations"):
         model.fit(X, Y)
     assert model.n_iter_ == 1
     assert np.isfinite(model.predict(X)).all()

@@ -221,7 +221,7 @@ def test_ctrl_c_leaves_it_out(sharing):
 
 
 def test_rows_of_trajectories_without_groups_are_warned_of_once():
-    with pytest.warns(DependentRowsWarning, match=r"Say in fit\(X, y, groups=\.\.\.\)") as caught:
+    with pytest.warns(DependentRowsWarning, match=r"Pass groups to fit\(X, y, groups=\.\.\.\)") as caught:
         fitted(None, sharing="none")
     assert len([own for own in caught if own.category is DependentRowsWarning]) == 1
 

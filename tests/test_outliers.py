@@ -94,7 +94,7 @@ def test_student_t_with_other_solvers_raises():
         evgp(noise="laplace").fit(X, Y)
     model = evgp(max_iter=5).partial_fit(X, Y)
     before = model.predict(GRID)
-    with pytest.raises(ValueError, match="partial_fit needs .* forgetting_factor=1 .* got forgetting_factor=0.9"):
+    with pytest.raises(ValueError, match="partial_fit needs .* forgetting_factor=1; got forgetting_factor=0.9"):
         model.partial_fit(X, Y, forgetting_factor=0.9)
     np.testing.assert_array_equal(model.predict(GRID), before)
 

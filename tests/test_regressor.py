@@ -301,7 +301,7 @@ def test_failed_refit_leaves_the_model_as_it_was():
     m.set_params(
         kernel_map=StandardScaler(), feature_map=None, noise=Gaussian(variance=1.0), kernel=RBF() + WhiteKernel()
     )
-    with pytest.raises(ValueError, match="give one of them"):
+    with pytest.raises(ValueError, match="Pass one of them only"):
         m.fit(np.hstack([X, X]), Y)
     np.testing.assert_array_equal(m.predict(X_NEW), before)
 

@@ -173,7 +173,7 @@ def test_names_need_a_data_frame():
 
 
 def test_more_outputs_than_columns_raise():
-    with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1; give base"):
+    with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1. Pass base"):
         ResidualRegressor(LinearRegression()).fit(X[:, :1], Y)
     assert ResidualRegressor(LinearRegression(), base=[0, 0]).fit(X[:, :1], Y).predict(X[:, :1]).shape == (60, 2)
 

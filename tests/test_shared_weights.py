@@ -253,7 +253,7 @@ def _not_symmetric(Sigma):
         ),
         ({"coef_prior": CoefPrior(cov=-np.eye(P))}, "cov of CoefPrior must have no negative variance"),
         ({"coef_prior": CoefPrior(cov=np.full((P, P), np.nan))}, "cov of CoefPrior must be finite"),
-        ({"coef_prior": CoefPrior(cov=np.eye(P), scale=1.0)}, "cov and scale=1.0 of CoefPrior both say"),
+        ({"coef_prior": CoefPrior(cov=np.eye(P), scale=1.0)}, "cov and scale=1.0 of CoefPrior both set"),
         (
             {"coef_prior": CoefPrior(cov=np.eye(P) + 0.1), "solver": LBFGS(posterior="diagonal")},
             r'cov of CoefPrior\) needs posterior="full"',

@@ -37,9 +37,11 @@ ADAM = ("paper", *AUTHORS_SCALE)
 NOMINAL_ERROR = 0.2
 # What convergence warnings say of a search that did not end by itself, and of what it found.
 ENDED_EARLY = re.compile(
-    "still (rising|fell)|stopped after|diverged|bound below the first|interrupted|ended since|not stay finite"
+    "still (rising|fell)|stopped after|diverged|bound below the first|interrupted|ended at max_time|not stay finite"
 )
-NOTHING_LEARNED = re.compile(r"of (\d+) of \d+ outputs fitted together, though|became white noise")
+NOTHING_LEARNED = re.compile(
+    r"for (\d+) of \d+ outputs that are fitted together\. The Gaussian process learned nothing|became white noise"
+)
 # Trajectories of a quick run.
 QUICK_TRAJECTORIES = 12
 # The paper's Table 4, by system and model. Both cartpoles have the numbers of the paper's only one.

@@ -152,7 +152,7 @@ def checked_columns(columns: ArrayLike | None, n_columns: int) -> np.ndarray | N
         or len(np.unique(found)) < n_columns
     ):
         raise ValueError(
-            f"columns={columns!r}: pass one index for each of the {n_columns} columns that the model was fitted to, "
-            "different ones, from 0."
+            f"columns={columns!r} must have a different index, from 0, for each of the {n_columns} columns that the "
+            "model was fitted to."
         )
     return found

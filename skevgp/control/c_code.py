@@ -103,11 +103,11 @@ def write_c(
     """Write a `casadi.Function` x -> (mean, variance) as C; return the paths of source and header."""
     ca, name = casadi(), function.name()  # names in C begin with the function's name
     if name in _TAKEN or name.startswith(_TAKEN_STARTS):
-        raise ValueError(f"name={name!r} means something else in C; give it another one.")
+        raise ValueError(f"name={name!r} is a reserved word of C. Choose another name.")
     source = Path(path)
     source = source if source.suffix == ".c" else source / f"{name}.c"
     if not source.parent.is_dir():
-        raise ValueError(f"path={os.fspath(path)!r}: there is no folder {str(source.parent)!r} to write to.")
+        raise ValueError(f"path={os.fspath(path)!r}: the folder {str(source.parent)!r} does not exist.")
     header = source.with_suffix(".h")
     parts = _parts_of(function, jacobian)
     generator = ca.CodeGenerator(name, {"with_header": False, "with_export": False, "prefix": f"{name}_"})

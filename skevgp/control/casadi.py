@@ -37,7 +37,9 @@ class Exported:
         """Return (x) -> (mean, variance) as a `casadi.Function`; if parametric, (x, parameters) -> (mean, variance)."""
         ca = casadi()
         if not (isinstance(name, str) and ca.Function.check_name(name)):
-            raise ValueError(f"name must be letters, digits and single underscores, a letter first; got {name!r}.")
+            raise ValueError(
+                f"name must have a letter first, then letters, digits and single underscores; got {name!r}."
+            )
         x = ca.MX.sym("x", self.n_columns)
         inputs: Mapped = x if self.kernel_map is None else _expression(self.kernel_map, x, "kernel_map")
         features: Mapped = ca.MX(0, 1)

@@ -84,7 +84,7 @@ class CompiledPredictor:
         check_fitted(model)
         predictor = model._posterior.predictor
         if not _goes_on(self._state[0], predictor):
-            raise ValueError("update needs a model of the same fit; compile a model that was fitted again.")
+            raise ValueError("update needs a model of the same fit. Compile a model again after it was fitted again.")
         self._freeze(predictor)
 
     def _freeze(self, predictor: Predictor) -> None:

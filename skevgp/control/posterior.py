@@ -89,8 +89,8 @@ class Posterior:
     def novelty(self, X: ArrayLike) -> np.ndarray:
         """Measure how far rows are from the training data.
 
-        Novelty is the share of the prior variance of f that the data leave, Var[f(x) | data] / Var[f(x)]. It is near 0
-        where f is known, and 1 where predictions depend on the features alone. It has no unit.
+        Novelty is the posterior variance of f divided by its prior variance, Var[f(x) | data] / Var[f(x)]. It is near 0
+        where f is known, and 1 where predictions depend on the features alone.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Posterior:
         Returns
         -------
         novelty : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            From 0 to 1.
+            Novelty of each row, from 0 to 1.
 
         Raises
         ------
@@ -128,10 +128,10 @@ class Posterior:
     def value_and_jacobian(self, X: ArrayLike, return_std: bool = False, include_noise: bool = True) -> Any:
         """Predict y and the derivatives of the prediction with respect to the columns of X.
 
-        Derivatives are exact for the transformers and kernels of this package, for scikit-learn's scalers,
-        PolynomialFeatures, SplineTransformer, PCA and TruncatedSVD, and for pipelines and unions of these. A map of
-        your own is exact with a method ``jacobian(X)`` that returns (n_samples, n_features_out, n_features). Other maps
-        are differentiated by central differences, to about ten digits if the map is smooth.
+        Derivatives are exact for the transformers and kernels of this package, and for pipelines and unions of them.
+        They are also exact for scikit-learn's scalers, PolynomialFeatures, SplineTransformer, PCA and TruncatedSVD.
+        Your own map is exact if it has a method ``jacobian(X)`` that returns (n_samples, n_features_out, n_features).
+        Other maps are differentiated by central differences, to about ten digits if the map is smooth.
 
         Parameters
         ----------
@@ -140,18 +140,19 @@ class Posterior:
         return_std : bool, default=False
             Whether to return the standard deviation and its derivatives too.
         include_noise : bool, default=True
-            Whether the standard deviation is that of y, with the learned noise, or that of the noise-free g(x).
+            Whether the standard deviation is that of y, with the learned noise. If False, it is that of the noise-free
+            g(x).
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
             The posterior mean, as `predict` returns it.
         jacobian : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
-            ∂mean/∂x.
+            Derivatives ∂mean/∂x.
         std : ndarray of the shape of ``mean``
-            The standard deviation. Only if ``return_std=True``.
+            The standard deviation. It is returned only if ``return_std`` is True.
         std_jacobian : ndarray of the shape of ``jacobian``
-            ∂std/∂x, and 0 where std is 0. Only if ``return_std=True``.
+            Derivatives ∂std/∂x, and 0 where std is 0. They are returned only if ``return_std`` is True.
 
         Raises
         ------
@@ -189,7 +190,7 @@ class Posterior:
         Returns
         -------
         jacobian : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
-            ∂mean/∂x, as `value_and_jacobian` returns it.
+            Derivatives ∂mean/∂x, as `value_and_jacobian` returns them.
 
         Raises
         ------
@@ -218,18 +219,18 @@ class Posterior:
         gradient : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
             The posterior mean of the gradient, as `jacobian` returns it.
         std : ndarray of the same shape
-            The standard deviation of each entry. Only if ``return_std=True``.
+            The standard deviation of each entry. It is returned only if ``return_std`` is True.
         cov : ndarray of shape (n_samples, n_features, n_features) or (n_samples, n_outputs, n_features, n_features)
-            The covariance of each gradient. Only if ``return_cov=True``.
+            The covariance of each gradient. It is returned only if ``return_cov`` is True.
 
         Raises
         ------
         ValueError, TypeError
-            If X does not fit the training data, is not finite, or is a Dask array; if both ``return_std`` and
-            ``return_cov`` are true; and if functions of the kernel have no gradient, such as Matern with nu=0.5.
+            If X does not fit the training data, is not finite, or is a Dask array. If both ``return_std`` and
+            ``return_cov`` are True. If functions of the kernel have no gradient, such as Matern with nu=0.5.
         """
         if return_std and return_cov:
-            raise ValueError("At most one of return_std and return_cov can be asked for.")
+            raise ValueError("At most one of return_std and return_cov can be requested.")
         fast, maps = self.compile(), as_maps(self.maps)
         parts, covariances = [], []
         for rows in self._few(X):
@@ -253,18 +254,19 @@ class Posterior:
     # --- what control loops and optimisers call -----------------------------------------------------------------------
 
     def compile(self, include_noise: bool = True) -> CompiledPredictor:
-        """Make a predictor for control loops, which is several times as fast for few rows and does not validate.
+        """Make a fast predictor for control loops, which does not validate its input.
 
         Parameters
         ----------
         include_noise : bool, default=True
-            Whether standard deviations are those of y, with the learned noise, or those of the noise-free g(x).
+            Whether standard deviations are those of y, with the learned noise. If False, they are those of the
+            noise-free g(x).
 
         Returns
         -------
         compiled : CompiledPredictor
-            It has ``predict`` and ``value_and_jacobian`` for arrays (n_features,) or (n_samples, n_features). Its
-            method ``update(model)`` copies the weights after a ``partial_fit``. Threads may share it, and it can be
+            Predictor with ``predict`` and ``value_and_jacobian`` for arrays (n_features,) or (n_samples, n_features).
+            Its method ``update(model)`` copies the weights after a ``partial_fit``. Threads may share it, and it can be
             pickled.
 
         Raises
@@ -272,7 +274,7 @@ class Posterior:
         NotFittedError
             If the model is not fitted.
         ValueError
-            If X had columns that are not numbers.
+            If the training data had columns that are not numbers.
 
         Examples
         --------
@@ -289,28 +291,30 @@ class Posterior:
     def to_l4acados(self, columns: ArrayLike | None = None, *, include_noise: bool = True) -> L4acadosModel:
         """Make a residual model for the controllers of L4acados, which plan with acados.
 
-        Fit the model to rows [x, u] and the residual that a nominal model of the next state leaves, x' - f(x, u), or
-        some of its columns. The argument ``B`` of the controller maps these to the state. L4acados is not imported.
+        Fit the model to rows [x, u] and the residual x' - f(x, u) of a nominal model, or to some columns of the
+        residual. The argument ``B`` of the controller maps these columns to the state. L4acados is not imported.
 
         Parameters
         ----------
         columns : array-like of shape (n_features,), default=None
-            Indices of the columns of [x, u] that the model was fitted to, in its order. If None, it was fitted to all.
+            Indices of the columns of [x, u] that the model was fitted to, in its order. If None, the model was fitted
+            to all columns.
         include_noise : bool, default=True
-            Whether variances are those of y, with the learned noise, or those of the noise-free g(x).
+            Whether variances are those of y, with the learned noise. If False, they are those of the noise-free g(x).
 
         Returns
         -------
         residual_model : L4acadosModel
-            It has ``value_and_jacobian``, ``evaluate``, ``jacobian`` and ``current_variance``, in L4acados' shapes. Its
-            method ``update(model)`` copies the weights after a ``partial_fit``.
+            Model with ``value_and_jacobian``, ``evaluate``, ``jacobian`` and ``current_variance``, in the shapes of
+            L4acados. Its method ``update(model)`` copies the weights after a ``partial_fit``.
 
         Raises
         ------
         NotFittedError
             If the model is not fitted.
         ValueError
-            If X had columns that are not numbers, or if ``columns`` are not different indices, one for each column.
+            If the training data had columns that are not numbers, or if ``columns`` does not have a different index for
+            each column.
 
         Examples
         --------
@@ -330,9 +334,9 @@ class Posterior:
     ) -> FunctionSamples:
         """Draw functions from the posterior that can be evaluated and differentiated anywhere.
 
-        Use them as scenarios in control and policy search. The mean is exact. The variance is within a few percent at
-        most rows, because f between inducing points is a sum of random waves (Wilson et al. 2020, with frequencies
-        drawn wider). `sample_y` draws exactly at given rows, and `rollout` exactly along paths.
+        Use them as scenarios in control and policy search. The mean is exact. The variance is approximate, because f
+        between inducing points is a sum of random waves (Wilson et al. 2020). `sample_y` is exact at given rows, and
+        `rollout` is exact along paths.
 
         Parameters
         ----------
@@ -346,15 +350,15 @@ class Posterior:
         Returns
         -------
         functions : FunctionSamples
-            A sequence of n callables. ``functions[i](X)`` is the noise-free g of an array (n_features,) or (n_rows,
-            n_features), without validation, and ``functions[i].value_and_jacobian(X)`` adds its derivatives.
+            Sequence of n callables. ``functions[i](X)`` is the noise-free g of an array (n_features,) or (n_rows,
+            n_features), without validation. ``functions[i].value_and_jacobian(X)`` adds its derivatives.
             ``functions(X)`` evaluates all functions at once, with a first axis of length n.
 
         Raises
         ------
         ValueError, TypeError
-            If ``n`` or ``n_waves`` is not a positive integer, X had columns that are not numbers, or functions of the
-            kernel cannot be drawn, as those of a `FunctionKernel`.
+            If ``n`` or ``n_waves`` is not a positive integer. If the training data had columns that are not numbers. If
+            functions of the kernel cannot be drawn, such as those of a `FunctionKernel`.
 
         References
         ----------
@@ -388,11 +392,11 @@ class Posterior:
         name : str, default="evgp"
             Name of the function.
         include_noise : bool, default=True
-            Whether the variance is that of y, with the learned noise, or that of the noise-free g(x).
+            Whether the variance is that of y, with the learned noise. If False, it is that of the noise-free g(x).
         parametric : bool, default=False
             Whether the function has a second argument ``parameters``, which `to_casadi_parameters` returns. An optimal
-            control problem that is built once can then follow a model that learns by `partial_fit`. The variance takes
-            a few times as long.
+            control problem that is built once can then follow a model that learns by `partial_fit`. The variance then
+            takes longer.
 
         Returns
         -------
@@ -405,9 +409,9 @@ class Posterior:
         ImportError
             If CasADi is not installed.
         ValueError, TypeError
-            If the kernel or a map has no expression in CasADi. A map of your own needs a method ``to_casadi(x)``, from
-            an MX of shape (n_features, 1) to one of shape (n_features_out, 1), or to a list of these if it returns a
-            row for each output.
+            If the kernel or a map has no expression in CasADi. Your own map needs a method ``to_casadi(x)``, from an MX
+            of shape (n_features, 1) to one of shape (n_features_out, 1). If it returns a row for each output,
+            ``to_casadi`` returns a list of these.
         sklearn.exceptions.NotFittedError
             If the model is not fitted.
 
@@ -446,9 +450,9 @@ class Posterior:
         Returns
         -------
         parameters : ndarray of shape (n_parameters,)
-            For each group of outputs with the same m inducing points: the weights of the mean, of shape (outputs of the
-            group, m + n_h), then the roots of the covariance, (outputs of the group, m + n_h, m + n_h). After all
-            groups: the offsets of the features' weights (n_outputs, n_h), the intercepts (n_outputs,) and the noise
+            Numbers of each group of outputs, then numbers of all outputs. A group of o outputs with m inducing points
+            has the weights of the mean (o, m + n_h), and the roots of the covariance (o, m + n_h, m + n_h). All outputs
+            have the offsets of the features' weights (n_outputs, n_h), the intercepts (n_outputs,) and the noise
             variances (n_outputs,). `partial_fit` changes weights and roots only.
 
         Raises
@@ -466,7 +470,7 @@ class Posterior:
         jacobian: bool = True,
         include_noise: bool = True,
     ) -> tuple[Path, Path]:
-        """Write mean and variance, and their Jacobians, as C that needs nothing but the standard library's mathematics.
+        """Write mean and variance, and their Jacobians, as C99 code without dependencies.
 
         Parameters
         ----------
@@ -477,12 +481,12 @@ class Posterior:
         jacobian : bool, default=True
             Whether to write functions for the Jacobians too.
         include_noise : bool, default=True
-            Whether the variance is that of y, with the learned noise, or that of the noise-free g(x).
+            Whether the variance is that of y, with the learned noise. If False, it is that of the noise-free g(x).
 
         Returns
         -------
         source, header : Path
-            The files. ``gcc -std=c99 -O2 -c evgp.c`` compiles them; link with ``-lm``.
+            The files. Compile them by ``gcc -std=c99 -O2 -c evgp.c``, and link with ``-lm``.
 
         Raises
         ------
@@ -498,9 +502,9 @@ class Posterior:
             int evgp_jacobian(const double *x, double *mean, double *variance,
                               double *mean_jacobian, double *variance_jacobian);
 
-        They return 0. Any result may be NULL. They use stack memory only (the header gives the size) and keep no state,
-        so that they may run in several threads and in an interrupt. ``casadi.external("evgp", ...)`` loads the compiled
-        library.
+        The functions return 0. A result that is not needed may be NULL. The functions keep no state and use stack
+        memory only, whose size the header gives. Thus they may run in several threads and in an interrupt.
+        ``casadi.external("evgp", ...)`` loads the compiled library.
         """
         function = self.to_casadi(name, include_noise=include_noise)
         return write_c(function, path, jacobian, self.maps.columns, include_noise)

@@ -40,27 +40,22 @@ def rollout(
     Parameters
     ----------
     regressor : estimator
-        Model of one step: fitted to rows x = [z, u] and next states z'. Any regressor with ``predict(X,
-        return_std=True)`` will do.
+        Model of one step, fitted to rows [z, u] and next states z'.
     z0 : array-like of shape (n_states,) or (n_batch, n_states)
         Initial states.
     U_or_controller : array-like of shape (n_steps, n_inputs) or (n_batch, n_steps, n_inputs), or callable
-        Inputs, or a function ``controller(z, t)`` of states (n, n_states) and the step t = 0, 1, ..., which returns
-        inputs (n, n_inputs). A system without inputs has an array of shape (n_steps, 0). With maps that have
-        ``dt="column"``, inputs are [u, Δt].
+        Inputs, or a function ``controller(z, t)`` of states (n, n_states) and the step t, which returns inputs (n,
+        n_inputs).
     n_steps : int, default=None
-        Number of steps. Required with a controller, and not allowed otherwise.
+        Number of steps, only with a controller.
     n_samples : int, default=100
-        Number of particles for each initial state, with ``method="sample"``.
+        Number of particles for each initial state.
     method : {"sample", "linearized", "mean"}, default="sample"
-        - ``"sample"``: each particle follows one function drawn from the posterior, exactly. Time grows with the cube
-          of the steps. Regressors of other packages draw each step independently.
-        - ``"linearized"``: mean and covariance to first order, Σ' = A Σ Aᵀ + Q. It treats the errors of the steps as
-          independent.
-        - ``"mean"``: feed the mean back. The std is that of the last step alone.
+        - ``"sample"``: each particle follows one function drawn from the posterior.
+        - ``"linearized"``: mean and covariance to first order, with independent steps.
+        - ``"mean"``: each step starts from the mean of the step before.
     process_noise : {"learned", "none"}, default="learned"
-        Whether to add the learned noise at each step. Use ``"none"`` if the noise was in the measurement of the states
-        and not in the system. Regressors of other packages need ``include_noise`` in ``predict`` for that.
+        Whether to add the learned noise at each step. Use ``"none"`` if the noise was in the measurement of the states.
     random_state : int, RandomState instance or None, default=None
         Seed of the particles.
 
@@ -71,51 +66,31 @@ def rollout(
 
         - mean, std : ndarray of shape (n_steps, n_states)
         - covariance : ndarray of shape (n_steps, n_states, n_states)
-        - samples : ndarray of shape (n_samples, n_steps, n_states); with ``method="sample"``
-        - inputs : ndarray of shape (n_steps, n_inputs); with ``method="sample"`` and a controller (n_samples, n_steps,
-          n_inputs)
+        - samples : ndarray of shape (n_samples, n_steps, n_states), with ``method="sample"``
+        - inputs : ndarray of shape (n_steps, n_inputs), or (n_samples, n_steps, n_inputs) with samples and a controller
 
     Raises
     ------
     ValueError, TypeError
-        If shapes do not fit, there are no steps, a state or an input is not finite, states grow beyond 1e100, or the
-        regressor has no ``return_std``.
+        If shapes do not fit, a value is not finite, or the regressor has no ``return_std``.
     NotFittedError
         If the regressor is not fitted.
 
     Notes
     -----
-    See the user guide, :doc:`/guide/rollouts`, on the choice of the method.
-
-    References
-    ----------
-    - J. T. Wilson et al. (2020): Efficiently Sampling Functions from Gaussian Process Posteriors.
-    - A. Girard et al. (2003): Gaussian Process Priors with Uncertain Inputs.
+    See the user guide, :doc:`/guide/rollouts`.
 
     Examples
     --------
     >>> from skevgp import EVGPRegressor, rollout
     >>> from skevgp.datasets import make_dynamics
-    >>> from skevgp.features import AngleEncoder, InertiaForceGravity
+    >>> from skevgp.features import InertiaForceGravity
     >>> train, test = (make_dynamics("pendulum", n, random_state=s) for n, s in [(20, 0), (1, 1)])
-    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), kernel_map=AngleEncoder("pendulum"), n_inducing=10)
-    >>> model = model.set_params(random_state=0).fit(train.data, train.target, groups=train.groups)
+    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
+    >>> model = model.fit(train.data, train.target, groups=train.groups)
     >>> ahead = rollout(model, test.data[0, :2], test.data[:50, 2:], random_state=0)
     >>> ahead.samples.shape, ahead.mean.shape
     ((100, 50, 2), (50, 2))
-
-    Fit rows with time steps of 10 ms and 30 ms, and predict steps of 20 ms:
-
-    >>> import numpy as np
-    >>> logs = [make_dynamics("pendulum", 10, 30, dt=dt, random_state=0) for dt in (0.01, 0.03)]
-    >>> X = np.vstack([np.column_stack([log.data, np.full(len(log.data), log.dt)]) for log in logs])
-    >>> y = np.vstack([log.target for log in logs])
-    >>> kernel_map = AngleEncoder("pendulum", dt="column")
-    >>> model = EVGPRegressor(InertiaForceGravity("pendulum", dt="column"), kernel_map=kernel_map, n_inducing=10)
-    >>> model = model.set_params(random_state=0).fit(X, y, groups=np.repeat(np.arange(20), 30))
-    >>> U = np.column_stack([np.zeros(50), np.full(50, 0.02)])  # [u, dt]
-    >>> rollout(model, [0.5, 0.0], U, random_state=0).mean.shape
-    (50, 2)
     """
     check_fitted(regressor)
     if method not in _METHODS:
@@ -299,7 +274,7 @@ def _drive(regressor: Any, batch: np.ndarray, given: ArrayLike | Controller, n_s
             raise ValueError("With a controller the regressor must have n_features_in_.")
         return _Drive(n_steps, columns - n_states, None, given)
     if n_steps is not None:
-        raise ValueError("n_steps is for a controller; given inputs say how many steps there are.")
+        raise ValueError("Pass n_steps only with a controller. The inputs determine the number of steps.")
     U = _finite(given, "U")
     n_inputs = columns - n_states if columns is not None else U.shape[-1]
     if U.ndim == 1 and n_inputs == 1:
@@ -315,13 +290,13 @@ def _drive(regressor: Any, batch: np.ndarray, given: ArrayLike | Controller, n_s
 def _finite(given: ArrayLike, name: str) -> np.ndarray:
     values = as_floats(given, name)
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
+        raise ValueError(f"{name} must be finite; it contains {values[~np.isfinite(values)][0]}.")
     return values
 
 
 def _within_limits(values: np.ndarray, t: int) -> np.ndarray:
     if not (np.abs(values) <= LARGEST).all():
-        raise ValueError(f"States grow beyond {LARGEST:g} at step {t}: the learned system is unstable.")
+        raise ValueError(f"States grow beyond {LARGEST:g} at step {t}. The learned system is unstable.")
     return values
 
 

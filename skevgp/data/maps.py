@@ -40,7 +40,7 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str, chosen: Chosen |
 def fresh_map(feature_map: Any, name: str) -> Any:
     """Clone a transformer. Raise TypeError if it is not one."""
     if isinstance(feature_map, Kernel):
-        raise TypeError(f"{name}={feature_map!r} is a kernel: give it as kernel=.")
+        raise TypeError(f"{name}={feature_map!r} is a kernel. Pass it as kernel=.")
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
         raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
     try:

@@ -29,7 +29,8 @@ def quintic_reference(
     Returns
     -------
     positions, velocities, accelerations : ndarray of shape (n_joints,) or (n_trajectories, n_joints)
-        The motion in rad or m, and its derivatives per s and s². For several times, of shape (..., n_times, n_joints).
+        The motion in rad or m, and its derivatives per s and s². For several times, the shape is (..., n_times,
+        n_joints).
 
     Raises
     ------
@@ -66,13 +67,12 @@ def quintic_reference(
 class ComputedTorqueController:
     """Move a robot along a smooth reference by feedback linearisation, for many trajectories at once.
 
-    Each call returns the torques
+    Each call computes the torques by the recursive Newton-Euler algorithm:
 
         τ = M(q) (q̈_d + k_p (q_d - q) + k_d (q̇_d - q̇) + k_i ∫(q_d - q) dt) + C(q, q̇) q̇ + g(q) + D q̇_d
 
-    by the recursive Newton-Euler algorithm, with the reference (q_d, q̇_d, q̈_d) of `quintic_reference` at the start
-    of the step and the model's viscous damping D. Use it as a controller of `simulate`, which holds torques over a step
-    and applies effort limits.
+    The reference (q_d, q̇_d, q̈_d) is that of `quintic_reference` at the start of the step. D is the viscous damping of
+    the model. Use the object as a controller of `simulate`, which holds torques over a step and applies effort limits.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ class ComputedTorqueController:
     q0, q1 : array-like of shape (n_joints,) or (n_trajectories, n_joints)
         Start and end of the reference, rad or m.
     duration : float
-        Duration of the reference motion, s. Then it stays at ``q1``.
+        Duration of the reference motion, s. Afterwards the reference stays at ``q1``.
     dt : float, default=0.03
         Length of a step, s.
     kp, kd, ki : float or array-like of shape (n_joints,), default=100.0, 20.0 and 1.0
-        Gains of position, velocity and integral, in 1/s², 1/s and 1/s³, at least 0. ``kd`` must be below 2 / dt, above
-        which the loop is unstable.
+        Gains of position, velocity and integral, in 1/s², 1/s and 1/s³, at least 0. ``kd`` must be below 2 / dt,
+        because larger gains are unstable.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class ComputedTorqueController:
             raise ValueError(f"q0 and q1 must have {n} columns for {layout.name!r}; got {self._q0.shape[1]}.")
         self._kp, self._kd, self._ki = (_gain(k, name, n) for k, name in ((kp, "kp"), (kd, "kd"), (ki, "ki")))
         if (self._kd * dt >= 2.0).any():
-            raise ValueError(f"kd must be below 2 / dt = {2.0 / dt:g}, or the held loop is unstable; got {kd!r}.")
+            raise ValueError(f"kd must be below 2 / dt = {2.0 / dt:g}, because larger gains are unstable; got {kd!r}.")
         self.integral = np.zeros_like(self._q0)
         self._next = 0
 

@@ -62,45 +62,32 @@ def make_dynamics(
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Simulate data sets of a robot, such as those of section IV-B of the paper.
 
-    The pendulum, the cartpole and the acrobot start at ``alpha * U(-1, 1)`` and are driven by inputs ``eta * N(0, 1)``,
-    held over each step, with the scales of the paper (its Table 1). ``"cartpole"`` is Drake's own example, without
-    friction. ``"cartpole_damped"`` has a damping of 0.1 N s/m and 0.1 N m s/rad on its joints, as in MIT's course
-    Underactuated Robotics until May 2022. The paper does not say which one it has.
-
-    The arm iiwa14 starts at rest with joints at U(-1.5, 1.5) rad, and moves to a target within 0.8 rad of each joint.
-    It follows a quintic reference by computed-torque control (gains 100, 20 and 1, held over each step), with noise of
-    standard deviation 0.1 * (3, 15, 3, 2, 2, 2, 0.05) N m on the torques. See Notes on other robots.
+    Each trajectory starts at a random state. Random inputs drive robots with a joint that has no motor, and the
+    pendulum. All other robots follow smooth references by computed-torque control. :doc:`Bring a URDF </howto/urdf>`
+    describes how each robot is sampled.
 
     Parameters
     ----------
     system : str, path-like, System or pinocchio.Model
-        Robot as in `load_robot`: ``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``, ``"acrobot"``, ``"iiwa14"``,
-        another name of `list_robots`, the path of a URDF file, or a model.
+        Robot as in `load_robot`: a name of `list_robots`, the path of a URDF file, or a model.
     n_trajectories : int, default=None
-        Number of trajectories, at least 1. If None, that of the paper (48, 93 for the acrobot, 465 for iiwa14), and 100
-        for other robots.
+        Number of trajectories. If None, that of the paper, or 100 for other robots.
     n_steps : int, default=None
-        Number of steps per trajectory, at least 1. If None, that of the paper (100, 50 for iiwa14), and 50 for other
-        robots.
+        Number of steps per trajectory. If None, that of the paper, or 50 for other robots.
     dt : float, default=0.03
-        Length of a step, s. Above 0.03 the gains of the controller are lower. Robots with light links need a short
-        step.
+        Length of a step, s. Robots with light links need a short step.
     duration : float, default=None
-        Duration of a controlled move, s. Then the target is held. If None, the move takes the whole trajectory. Only
-        for robots that are controlled.
+        Duration of a controlled move, s. Afterwards the target is held. If None, the move takes the whole trajectory.
     noise : float, default=0.0
-        Standard deviation of the Gaussian noise on each target, as a fraction of the standard deviation of that target.
+        Standard deviation of the Gaussian noise on each target, as a share of the standard deviation of that target.
     input_noise : float, default=0.0
-        Standard deviation of the noise on the states in ``data``, as a fraction of that of each state. Inputs are
-        exact.
+        Standard deviation of the noise on the states in ``data``, as a share of that of each state.
     wrap_angles : bool, default=False
-        Whether to wrap revolute positions in ``data`` to [-pi, pi), after noise was added. ``target`` is shifted by the
-        same multiple of 2 pi, so that the difference stays small.
+        Whether to wrap revolute positions in ``data`` to [-pi, pi). ``target`` is shifted by the same multiple of 2 pi.
     n_jobs : int, default=None
-        Number of processes for the simulation, as in `simulate`. The result does not depend on it.
+        Number of processes, as in `simulate`. The result does not depend on it.
     random_state : int, RandomState instance or None, default=None
-        Seed of the initial states, of the inputs (or the targets, then the noise on the torques), and of the noise on
-        states and targets, in this order.
+        Seed of the initial states, the inputs and the noise.
     return_X_y : bool, default=False
         Whether to return ``(data, target)`` instead of a Bunch.
 
@@ -109,36 +96,28 @@ def make_dynamics(
     dynamics : :class:`~sklearn.utils.Bunch`
         The data set, with n_rows = n_trajectories * n_steps, one trajectory after the other:
 
-        - ``data`` : ndarray of shape (n_rows, 2 * n_joints + n_inputs): positions (rad or m), velocities (rad/s or
-          m/s) and inputs within the motors' limits (N m or N);
-        - ``target`` : ndarray of shape (n_rows, 2 * n_joints): positions and velocities after ``dt``;
-        - ``groups`` : ndarray of shape (n_rows,): the trajectory of each row, for `GroupKFold`;
-        - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints): true states, not wrapped;
-        - ``dt`` : float, and ``robot``, as given, for feature maps (``InertiaForce(robot, dt=dt)``);
+        - ``data`` : ndarray of shape (n_rows, 2 * n_joints + n_inputs), with positions, velocities and inputs in SI
+          units;
+        - ``target`` : ndarray of shape (n_rows, 2 * n_joints), with positions and velocities after ``dt``;
+        - ``groups`` : ndarray of shape (n_rows,), with the trajectory of each row;
+        - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints), with the true states;
+        - ``dt`` and ``robot``, as given, for feature maps such as ``InertiaForce(robot, dt=dt)``;
         - ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
-        Only if ``return_X_y``.
+        Returned only if ``return_X_y`` is True.
 
     Raises
     ------
     ImportError
         If Pinocchio is not installed.
     ValueError, TypeError
-        If an argument is out of its range or of the wrong type, the robot is unknown, it cannot be simulated (see
-        `simulate`), or controlled moves are unstable because ``dt`` is too long or ``duration`` too short.
+        If an argument is out of its range or of the wrong type. If the robot is unknown or cannot be simulated. If
+        controlled moves are unstable, because ``dt`` is too long or ``duration`` is too short.
 
     Warns
     -----
     RobotModelWarning
         If the model of the robot is unphysical, as in `load_robot`.
-
-    Notes
-    -----
-    Any other robot whose joints are all driven moves like iiwa14 within its position limits. The noise on its torques
-    is a tenth of the torques that hold it and accelerate each joint by 1 rad/s², or less if that would accelerate a
-    light link by more than 2 rad/s². A robot with a joint without motor starts in a random state within its limits, and
-    is driven by random inputs of that size, like the acrobot. A robot with the name and the size of a named system is
-    sampled like it. See `simulate` on forces and computing times.
 
     Examples
     --------

@@ -46,8 +46,8 @@ class Plant:
             free = np.flatnonzero(np.linalg.norm(null, axis=1) > 0.1)
             raise ValueError(
                 f"The mass matrix of {self.layout.name!r} is singular: no inertia resists the motion of the joints "
-                f"{[self.layout.position_names[joint] for joint in free]}. Give their links inertia, or the model "
-                "armature."
+                f"{[self.layout.position_names[joint] for joint in free]}. Add inertia to their links, or armature "
+                "to the model."
             )
         return M
 

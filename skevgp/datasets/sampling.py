@@ -38,8 +38,8 @@ class RandomInputs:
     ) -> tuple[np.ndarray, Controller]:
         if duration is not None:
             raise ValueError(
-                f"duration is the time of a controlled move; {plant.layout.name!r} is driven by random inputs. "
-                f"Got {duration!r}."
+                f"duration is the time of a controlled move, but {plant.layout.name!r} is driven by random inputs; got "
+                f"{duration!r}."
             )
         z0 = self.center + self.scale * rng.uniform(-1.0, 1.0, (shape[0], len(self.scale)))
         inputs = self.input_scale * rng.standard_normal((*shape, len(self.input_scale)))
@@ -79,9 +79,9 @@ class ControlledMoves:
             lost = (np.abs(Z[:, n:]) > fastest).any(axis=0)
             if lost.any():
                 raise ValueError(
-                    f"The controlled moves of {plant.layout.name!r} run away in step {step}, at the joints "
-                    f"{[plant.layout.position_names[joint] for joint in np.flatnonzero(lost)]}: the held controller is "
-                    f"unstable at this dt of {dt} s. Lower dt, or give a longer duration."
+                    f"The controlled moves of {plant.layout.name!r} are unstable in step {step}, at the joints "
+                    f"{[plant.layout.position_names[joint] for joint in np.flatnonzero(lost)]}. Lower dt={dt} s, or "
+                    "pass a longer duration."
                 )
             return controller(step, Z) + noise[:, step]
 

@@ -58,10 +58,10 @@ def simulate(
     return_inputs: bool = False,
     n_jobs: int | None = None,
 ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
-    """Integrate a robot's equations of motion with the input held over each step.
+    """Integrate the equations of motion of a robot, with the input held over each step.
 
-    Accelerations are those of Pinocchio's articulated-body algorithm, with the model's effort limits and viscous
-    damping. A model whose effort limits are all 0 has no limits. Dry friction, contacts, and limits of positions and
+    Pinocchio's articulated-body algorithm gives the accelerations, with the effort limits and the viscous damping of
+    the model. A model whose effort limits are all 0 has no limits. Dry friction, contacts, and limits of positions and
     velocities are not simulated.
 
     Parameters
@@ -71,35 +71,34 @@ def simulate(
     z0 : array-like of shape (2 * n_joints,) or (n_trajectories, 2 * n_joints)
         Initial states: joint positions (rad or m), then velocities (rad/s or m/s).
     U : array-like of shape (n_steps, n_inputs) or (n_trajectories, n_steps, n_inputs), or callable
-        Torques (N m) or forces (N) on the driven joints, each held for ``dt``. Or a function ``controller(step, Z)``
-        that is called once per step with the states (n_trajectories, 2 * n_joints), and returns the inputs
-        (n_trajectories, n_inputs).
+        Torques (N m) or forces (N) on the driven joints, or a function ``controller(step, Z)``. The function is called
+        once per step with the states (n_trajectories, 2 * n_joints), and returns the inputs (n_trajectories, n_inputs).
     dt : float, default=0.03
-        Length of a step, s. A `ComputedTorqueController` must have the same.
+        Length of a step, s. A `ComputedTorqueController` must have the same ``dt``.
     n_steps : int, default=None
-        Number of steps. Only with a controller.
+        Number of steps. It is required with a controller, and not allowed otherwise.
     wrap_angles : bool, default=False
         Whether to return revolute positions in [-pi, pi). A controller always gets them unwrapped.
     return_inputs : bool, default=False
         Whether to return the inputs within the motors' limits too.
     n_jobs : int, default=None
-        Number of processes for groups of 64 trajectories (None: 1, -1: all cores). The result does not depend on it.
-        For the data sets of the paper one process is faster.
+        Number of processes for groups of 64 trajectories. If None, 1; if -1, all cores. The result does not depend on
+        it.
 
     Returns
     -------
     Z : ndarray of shape (n_steps + 1, 2 * n_joints) or (n_trajectories, n_steps + 1, 2 * n_joints)
-        States at the times 0, dt, 2 dt, ...; the first is ``z0``.
+        States at the times 0, dt, 2 dt, ... The first one is ``z0``.
     inputs : ndarray of shape (n_steps, n_inputs) or (n_trajectories, n_steps, n_inputs)
-        ``U`` within the motors' limits. Only if ``return_inputs``.
+        Inputs ``U`` within the limits of the motors. They are returned only if ``return_inputs`` is True.
 
     Raises
     ------
     ImportError
         If Pinocchio is not installed.
     ValueError, TypeError
-        If a shape does not fit the robot, a value is not a finite real number, ``dt`` is not positive, the robot is
-        unknown, its mass matrix is singular (links without inertia), or the integrator fails.
+        If a shape does not fit the robot, a value is not a finite real number, or ``dt`` is not positive. If the robot
+        is unknown, its mass matrix is singular, or the integrator fails.
 
     Warns
     -----
@@ -112,10 +111,9 @@ def simulate(
 
     Notes
     -----
-    The integrator is SciPy's DOP853 with a relative tolerance of 1e-11, started again at each step, for 64 trajectories
-    together. If damping acts more than 200 times faster than ``dt`` in one of their initial states, it is the implicit
-    Radau with a tolerance of 1e-6. Robots with light links and strong damping, such as ``"xarm7"``, take several times
-    as long as others.
+    The integrator is SciPy's DOP853 with a relative tolerance of 1e-11, started again at each step. If damping acts
+    more than 200 times faster than ``dt``, the implicit Radau with a tolerance of 1e-6 is used instead. Robots with
+    light links and strong damping, such as ``"xarm7"``, take longer than others.
 
     Examples
     --------
@@ -151,12 +149,12 @@ def simulate(
         )
     if callable(U):
         if n_steps is None:
-            raise ValueError("With a controller, n_steps is needed.")
+            raise ValueError("A controller needs n_steps.")
         if isinstance(U, ComputedTorqueController) and not math.isclose(U.dt, dt):
             raise ValueError(f"dt must be that of the controller, {U.dt!r}; got {dt!r}.")
         n_steps, controller = check_integer(n_steps, "n_steps", minimum=0), U
     elif n_steps is not None:
-        raise ValueError(f"n_steps is for a controller; the inputs U have their own number of steps. Got {n_steps!r}.")
+        raise ValueError(f"Pass n_steps={n_steps!r} only with a controller. U determines the number of steps.")
     else:
         n_steps, controller = _held(as_floats(U, "U"), len(z), n_inputs, single, layout.name)
     if not np.isfinite(z).all():

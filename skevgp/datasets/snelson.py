@@ -93,7 +93,7 @@ def _fetch(folder: Path, n_retries: int, delay: float) -> dict[str, np.ndarray]:
         reason = str(problem).rstrip(".")
         raise OSError(
             f"Snelson's data could not be fetched from {_ADDRESS} ({reason}). Put the files {', '.join(_CHECKSUMS)} "
-            f"(with or without .dat) into {folder}, or give a folder that holds them as data_home."
+            f"(with or without .dat) into {folder}, or pass their folder as data_home."
         ) from problem
     folder.mkdir(exist_ok=True)
     for name, content in contents.items():
@@ -133,39 +133,42 @@ def fetch_snelson(
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Load Snelson's one-dimensional data, as in the toy figure of the paper.
 
-    They are 200 noisy observations of a wave at x between 0.06 and 5.97 (Snelson & Ghahramani 2006). The paper adds a
-    line: (y, x) <- (6 y + 3 x, x). The files are downloaded once from
-    http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz.
+    The data are 200 noisy observations of a wave (Snelson & Ghahramani 2006). The paper adds a line to the target, 6 y
+    + 3 x. The files are downloaded once from http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz.
 
     Parameters
     ----------
     data_home : str or path-like, default=None
-        Folder with the files ``train_inputs``, ``train_outputs`` and ``test_inputs`` (with or without ``.dat``), or
-        with a folder ``SPGP_dist`` that has them. Otherwise they are downloaded into ``SPGP_dist``. If None,
-        scikit-learn's folder of data sets, see :func:`sklearn.datasets.get_data_home`.
+        Folder with the files ``train_inputs``, ``train_outputs`` and ``test_inputs`` (with or without ``.dat``). A
+        folder ``SPGP_dist`` inside of it may hold them too, and downloaded files go there. If None, scikit-learn's
+        folder of data sets (:func:`sklearn.datasets.get_data_home`).
     download_if_missing : bool, default=True
         Whether to download missing files.
     trend : bool, default=True
-        Whether the target is 6 y + 3 x, as in the paper, or Snelson's y.
+        Whether the target is 6 y + 3 x, as in the paper. If False, it is Snelson's y.
     return_X_y : bool, default=False
         Whether to return ``(data, target)`` instead of a Bunch.
     n_retries : int, default=3
         Number of retries if the server does not answer, at least 0.
     delay : float, default=1.0
-        Number of seconds between tries, at least 0.
+        Time between tries, in seconds, at least 0.
 
     Returns
     -------
     snelson : :class:`~sklearn.utils.Bunch`
-        The data set: ``data`` of shape (200, 1), in the order of the file; ``target`` (200,); ``test_data`` (301, 1),
-        evenly spaced from -3 to 10, without targets; ``feature_names``, ``target_names`` and ``DESCR``.
+        Dictionary-like object with
+
+        - ``data`` : ndarray of shape (200, 1), in the order of the file;
+        - ``target`` : ndarray of shape (200,);
+        - ``test_data`` : ndarray of shape (301, 1), evenly spaced from -3 to 10, without targets;
+        - ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
-        Only if ``return_X_y``.
+        Returned only if ``return_X_y`` is True.
 
     Raises
     ------
     OSError
-        If files are missing and cannot or must not be downloaded, or their numbers have another SHA-256 checksum.
+        If files are missing and cannot or must not be downloaded, or if their numbers have another SHA-256 checksum.
     ValueError, TypeError
         If an argument is out of its range or of the wrong type.
 

@@ -35,8 +35,8 @@ def make_toy(
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Generate a noisy wave on a linear trend, similar to the toy data of the paper.
 
-    The paper uses Snelson's 200 points, x in (0, 6), with (y, x) <- (6 y + 3 x, x): see `fetch_snelson`. These points
-    are random, with waves of similar places, heights and noise. Features ``h(x) = (1, x)`` explain the trend.
+    The paper uses Snelson's 200 points, which `fetch_snelson` loads. These points are random, with similar waves and
+    similar noise. The features ``h(x) = (1, x)`` explain the trend.
 
     Parameters
     ----------
@@ -52,10 +52,14 @@ def make_toy(
     Returns
     -------
     toy : :class:`~sklearn.utils.Bunch`
-        The data set: ``data`` of shape (n_samples, 1), sorted and in (0, 6); ``target`` (n_samples,); ``mean``
-        (n_samples,), the target without noise; ``feature_names``, ``target_names`` and ``DESCR``.
+        Dictionary-like object with
+
+        - ``data`` : ndarray of shape (n_samples, 1), sorted and in (0, 6);
+        - ``target`` : ndarray of shape (n_samples,);
+        - ``mean`` : ndarray of shape (n_samples,), the target without noise;
+        - ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
-        Only if ``return_X_y``.
+        Returned only if ``return_X_y`` is True.
 
     Raises
     ------

@@ -110,42 +110,42 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool or "joint", default=False
-            Whether to return the covariance between rows too, for each output. ``"joint"`` includes the covariance
-            between outputs, which depend on each other if they share their weights or parameters of the features.
+            Whether to return the covariance between rows too, for each output. If ``"joint"``, the covariance between
+            outputs is included. Outputs depend on each other if they share their weights or parameters of the features.
         include_noise : bool, default=True
-            Whether standard deviation and covariance include the learned noise of y, or are those of the noise-free
-            g(x).
+            Whether standard deviation and covariance include the learned noise of y. If False, they are those of the
+            noise-free g(x).
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
             Posterior mean.
         std : ndarray of the same shape
-            Standard deviation. Only if ``return_std``.
+            Standard deviation. It is returned only if ``return_std`` is True.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
-            Covariance. Only if ``return_cov``. For ``"joint"``, of shape (n_samples * n_outputs, n_samples *
-            n_outputs), in the order of ``mean.ravel()``.
+            Covariance. It is returned only if ``return_cov`` is set. With ``"joint"``, its shape is (n_samples *
+            n_outputs, n_samples * n_outputs), in the order of ``mean.ravel()``.
 
         Raises
         ------
         ValueError
-            If X does not fit the training data or is not finite, if both ``return_std`` and ``return_cov`` are set, or
-            if ``return_cov`` is set for a Dask array.
+            If X does not fit the training data or is not finite. If both ``return_std`` and ``return_cov`` are set, or
+            ``return_cov`` is set for a Dask array.
 
         Notes
         -----
-        The diagonal of the covariance is the square of ``std``. Variances are not below their rounding error, about
+        The diagonal of the covariance is the square of ``std``. Variances are at least their rounding error, about
         1e-15 of the signal variance.
         """
         if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
         if return_std and return_cov:
-            raise ValueError("At most one of return_std and return_cov can be asked for.")
+            raise ValueError("At most one of return_std and return_cov can be requested.")
         if not self.__sklearn_is_fitted__():
             return self._before_fit(X).predict(X, return_std, return_cov, include_noise)
         if is_dask(X):
             if return_cov:
-                raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
+                raise ValueError("return_cov needs all rows in memory. Pass X.compute() instead of a Dask array.")
             X = as_rows(X, "X", known=False)
             checked_rows(self, X)
             shape = () if self._n_outputs == 1 else (self._n_outputs,)
@@ -170,7 +170,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         random_state : int, RandomState instance or None, default=0
             Seed of the functions. An integer gives the same functions at each call.
         include_noise : bool, default=True
-            Whether samples are those of y, with the learned noise, or those of the noise-free g(x).
+            Whether samples are those of y, with the learned noise. If False, they are those of the noise-free g(x).
 
         Returns
         -------
@@ -205,7 +205,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Returns
         -------
         summary : ModelSummary
-            Object that prints as text, shows as tables in notebooks, and has ``to_frame()``.
+            Object that prints as text. A notebook shows it as tables, and ``to_frame()`` returns a data frame.
         """
         check_fitted(self)
         return of_gaussian_process(self)
@@ -223,9 +223,10 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return bundle
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters. With ``solver__...``, a solver that is a string becomes an object.
+        """Set parameters of the estimator and of its nested objects.
 
-        So do a noise and a prior of the weights.
+        With ``solver__...``, a solver that is a string becomes an object. The same holds for the noise and the prior of
+        the weights.
 
         Parameters
         ----------
@@ -250,7 +251,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         kind = type(self).__name__
         if name in _OF_WEIGHTS:
             raise AttributeError(
-                f"{kind} has {name} only after a fit with a feature_map: without one there are no weights."
+                f"{kind} has {name} only after a fit with a feature_map, because its features have the weights."
             )
         if name in _OF_THETA:
             raise AttributeError(f"{kind} has {name} only after a fit with a feature_map that has parameters.")
@@ -275,7 +276,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         if is_plain(self, X):
             return Rows(X, X)
         if is_dask(X):
-            raise ValueError(f"{asked} needs rows in memory: not for Dask arrays. Give it X.compute().")
+            raise ValueError(f"{asked} needs rows in memory. Pass X.compute() instead of a Dask array.")
         return Rows(*checked_rows(self, X)[:2])
 
     def _checked_numbers(self, X: Any, asked: str) -> np.ndarray:
@@ -283,7 +284,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         if is_plain(self, X):
             return X
         if is_dask(X):
-            raise ValueError(f"{asked} needs rows in memory: not for Dask arrays. Give it X.compute().")
+            raise ValueError(f"{asked} needs rows in memory. Pass X.compute() instead of a Dask array.")
         return checked_numbers(self, X)[0]
 
     @property

@@ -58,13 +58,12 @@ _STILL_FELL = (
 
 
 class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
-    r"""Neural network with uncertain weights: a deep Bayesian neural network, the DBNN of the paper.
+    r"""Deep Bayesian neural network, the DBNN of the paper.
 
-    The hidden layers are LeakyReLU units. Each weight has a normal variational distribution :math:`q(w) = N(\mu, s^2)`,
-    independent of the other weights, and the prior :math:`N(0, \text{prior\_scale}^2)`. Biases are numbers. The noise
-    variance of each output is learned. Adam maximises the evidence lower bound on mini-batches. It draws
-    pre-activations row by row instead of weights, the local reparameterisation trick of Kingma et al. (2015). Inputs
-    and targets are standardised internally.
+    The hidden layers are LeakyReLU units. Each weight has an independent normal distribution :math:`q(w) = N(\mu,
+    s^2)`, and the prior :math:`N(0, \text{prior\_scale}^2)`. Adam maximises the evidence lower bound on mini-batches
+    with the local reparameterisation trick. The noise variance of each output is learned. Inputs and targets are
+    standardised internally.
 
     Parameters
     ----------
@@ -73,36 +72,31 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     negative_slope : float, default=0.01
         Slope of LeakyReLU for negative inputs, in [0, 1].
     prior_scale : float or array-like of shape (n_layers,), default=None
-        Prior standard deviation of the weights of all layers, or of each layer, for standardised inputs and targets.
-        If None, it is 1 / sqrt(fan in), so that the outputs of a layer have the size of its inputs.
+        Prior standard deviation of the weights of all layers, or of each layer, for standardised inputs and targets. If
+        None, 1 / sqrt(fan in).
     batch_size : int or "auto", default="auto"
-        Number of rows per step. ``"auto"`` is 200, or all rows if there are fewer.
+        Number of rows per step. If ``"auto"``, 200, or all rows if there are fewer.
     learning_rate_init : float, default=0.01
-        First step size of Adam. It falls to zero along half a cosine: over ``max_iter`` epochs, or over the last steps.
+        First step size of Adam. It falls to zero along half a cosine.
     max_iter : int, default=None
-        Maximum number of epochs, which are passes over the rows. If None, it is 100, or more if 100 epochs are fewer
-        than 5000 steps.
+        Maximum number of epochs, which are passes over the rows. If None, 100 epochs or 5000 steps, whichever is more.
     tol : float, default=0.01
-        Tolerance of the loss, in nats per row. When the loss stays flat, Adam begins its last steps, which are as many
-        as the steps before. The loss is flat if its medians over the last third of the steps and over the third before
-        differ by less than ``tol``, or by no more than chance. With ``early_stopping``, ``tol`` also is the least gain
-        that counts.
+        Tolerance of the loss, in nats per row. When the median loss over a third of the steps changes by less, Adam
+        begins its last steps. With ``early_stopping``, ``tol`` is also the least gain that counts.
     early_stopping : bool, default=False
-        Whether to hold out rows and to keep the parameters that predict those best.
+        Whether to hold out rows, and keep the parameters that predict these rows best.
     validation_fraction : float, default=0.1
-        Share of the rows that is held out, in (0, 1). Only with ``early_stopping``.
+        Share of the rows that ``early_stopping`` holds out, in (0, 1).
     n_iter_no_change : int, default=10
-        Number of successive epochs without a gain on the held-out rows after which the fit ends. Only with
-        ``early_stopping``.
+        Number of epochs without a gain on the held-out rows after which ``early_stopping`` ends the fit.
     n_samples : int, default=100
-        Number of draws of the weights for predictions. They are drawn once, at the end of `fit`, and each takes 8 bytes
-        per weight.
+        Number of draws of the weights for predictions. They are drawn once, at the end of `fit`.
     warm_start : bool, default=False
         Whether to start from the parameters of the last fit, if it had the same layers.
     random_state : int, RandomState instance or None, default=None
         Seed of the first weights, mini-batches, pre-activations, held-out rows and the weights for predictions.
     verbose : int, default=0
-        Progress messages, as in `EVGPRegressor`. An iteration is a step, and the bound is per row.
+        Verbosity, as in `EVGPRegressor`. An iteration is a step, and the bound is per row.
 
     Attributes
     ----------
@@ -115,13 +109,13 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     noise_variance_ : float or ndarray of shape (n_outputs,)
         Noise variance of each output, in squared units of y.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the evidence lower bound per row, in nats: its mean over the mini-batches of each epoch.
+        Minus the evidence lower bound per row, in nats, averaged over the mini-batches of each epoch.
     validation_scores_ : ndarray of shape (n_iter,) or None
-        Expected log likelihood per held-out row, in nats, after each epoch. None without ``early_stopping``.
+        Expected log likelihood per held-out row, in nats, after each epoch. It is None without ``early_stopping``.
     n_iter_ : int
         Number of epochs. The last one may be incomplete.
     n_parameters_ : int
-        Number of parameters: two for each weight, one for each bias and one for the noise of each output.
+        Number of parameters of weights, biases and noise.
     n_features_in_ : int
         Number of columns of X.
     feature_names_in_ : ndarray of str
@@ -134,7 +128,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     Notes
     -----
     The weights are independent (mean field). Therefore, predicted standard deviations are too small far from the data.
-    Weights that the data do not need return to their prior. With few rows and much noise, all of them may.
+    With few rows and much noise, all weights may return to their prior.
 
     References
     ----------
@@ -277,14 +271,16 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     def predict(
         self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
     ) -> Any:
-        """Predict the mean over draws of the weights. All rows and all calls use the same draws.
+        """Predict the mean over draws of the weights.
+
+        All rows and all calls use the same draws.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
             Rows with the columns of `fit`.
         return_std, return_cov : bool, default=False
-            Whether to return the standard deviation, or the covariance between rows, also.
+            Whether to return the standard deviation, or the covariance between rows, too.
         include_noise : bool, default=True
             Whether the standard deviation and the covariance include the learned noise.
 
@@ -293,17 +289,17 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
             Predicted mean of y at each row.
         std : ndarray of the same shape
-            Standard deviation, if ``return_std``.
+            Standard deviation. It is returned only if ``return_std`` is True.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
-            Covariance between rows, if ``return_cov``.
+            Covariance between rows. It is returned only if ``return_cov`` is True.
 
         Raises
         ------
         ValueError
-            If X does not fit the training data, is not finite, or both ``return_std`` and ``return_cov`` are set.
+            If X does not fit the training data or is not finite, or if both ``return_std`` and ``return_cov`` are set.
         """
         if return_std and return_cov:
-            raise ValueError("At most one of return_std and return_cov can be asked for.")
+            raise ValueError("At most one of return_std and return_cov can be requested.")
         blocks = self._blocks_of_outputs(self._validated(X), self._weights)
         scale, offset = self._scaling.y_scale, self._scaling.y_mean
         noise = self._noise if include_noise else np.zeros_like(self._noise)
@@ -366,7 +362,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         scales = as_floats(self.prior_scale, "prior_scale")
         if scales.ndim > 1 or (scales.ndim == 1 and len(scales) != len(sizes) - 1):
             raise ValueError(
-                f"prior_scale must be a number or {len(sizes) - 1}, one a layer; got {self.prior_scale!r}."
+                f"prior_scale must be a number or one for each of {len(sizes) - 1} layers; got {self.prior_scale!r}."
             )
         if not ((scales >= 1e-30) & (scales <= 1e30)).all():
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
@@ -386,7 +382,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         n_held_back = max(1, round(self.validation_fraction * len(X))) if self.early_stopping else 0
         if n_held_back == len(X):
             raise ValueError(
-                f"validation_fraction={self.validation_fraction!r} of {len(X)} rows leaves none to learn from."
+                f"validation_fraction={self.validation_fraction!r} of {len(X)} rows leaves no rows for training."
             )
         held_back = np.zeros(len(X), dtype=np.bool_)
         held_back[rng.permutation(len(X))[:n_held_back]] = True

@@ -41,70 +41,62 @@ class EGPRegressor(GaussianProcess):
     .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
               f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
 
-    without approximation. Kernel and noise maximise the log marginal likelihood with the weights integrated out. Time
-    is cubic and memory quadratic in the number of rows. Use it for up to a few thousand rows, and as a reference.
+    without approximation. Time is cubic and memory quadratic in the number of rows. Use it for up to a few thousand
+    rows.
 
     Parameters
     ----------
     feature_map : transformer, default=None
-        Transformer x -> h(x), for example `InertiaForceGravity("pendulum")`. It gets X as given, so do not scale the
-        columns of X. It may return a row for each output, (n, n_outputs, n_h).
+        Transformer x -> h(x), as in `EVGPRegressor`.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f, as in `EVGPRegressor`. Outputs have the same kernel shape, and their own signal variances.
+        Covariance of f, as in `EVGPRegressor`. Outputs share its shape, and have their own signal variances.
     kernel_map : transformer, default=None
-        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel gets its result, so scale
-        columns here. It may return a row for each output, (n, n_outputs, d).
+        Transformer x -> inputs of the kernel, as in `EVGPRegressor`.
     coef_prior : skevgp.CoefPrior or "auto", default="auto"
-        Prior of the weights β. If ``"auto"``, it is that of the feature map. ``CoefPrior(scale=np.inf)`` is a vague
-        prior.
+        Prior of the weights β. If ``"auto"``, that of the feature map. ``CoefPrior(scale=np.inf)`` is vague.
     noise : "gaussian" or `skevgp.noise.Gaussian`, default="gaussian"
-        Noise model. ``Gaussian(variance=...)`` sets the start of its variance.
+        Noise model.
     alpha : float, default=None
-        Known noise variance, which is not learned. If rows differ, pass their mean here, and their variances in units
-        of it as ``relative_variance`` of `fit`. ``std`` includes it.
+        Known noise variance. If None, it is learned.
     discrepancy : {"free", "orthogonal"}, default="free"
         Whether f may imitate the features, as in `EVGPRegressor`.
     normalize_y : bool, default=False
-        Whether the prior mean is the training mean of y instead of 0. If y is constant, the signal has a standard
-        deviation of 1.
+        Whether the prior mean is the training mean of y instead of 0.
     optimizer : "fmin_l_bfgs_b", callable or None, default="fmin_l_bfgs_b"
-        Optimiser of kernel and noise. If None, the kernel is used as given, and missing numbers are 1. A callable has
-        the interface of `GaussianProcessRegressor` (see Notes).
+        Optimiser of kernel and noise, with the interface of `GaussianProcessRegressor` (see Notes). If None, the kernel
+        is used as given.
     max_iter : int, default=1000
-        Maximum number of iterations of L-BFGS from each start. With 0, kernel and noise stay at their start.
+        Maximum number of iterations from each start.
     max_time : float, default=None
-        Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning.
+        Number of seconds until iterations end. The best parameters so far are kept.
     n_restarts : int, default=0
-        Number of further fits, with kernel and noise drawn log-uniformly around the first start within their bounds.
-        The likeliest fit is kept.
+        Number of further fits from random starts. The likeliest fit is kept.
     tol : float or "auto", default="auto"
-        Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row gains less,
-        and stops when such a start gains no more. ``"auto"`` is 0.01, and 1e-9 for 100 rows or fewer.
+        Tolerance in nats, as in `skevgp.solvers.LBFGS`. If ``"auto"``, 0.01, or 1e-9 for 100 rows or fewer.
     n_targets : int, default=None
-        Number of outputs of y, for `predict` and `sample_y` before a fit. If None, 1.
+        Number of outputs, for `predict` and `sample_y` before a fit. If None, 1.
     random_state : int, RandomState instance or None, default=None
         Seed of the restarts.
     verbose : int, default=0
-        Progress messages, as in `EVGPRegressor`. The bound is the log marginal likelihood.
+        Verbosity, as in `EVGPRegressor`. The bound is the log marginal likelihood.
 
     Attributes
     ----------
     coef_, coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior means and standard deviations of the weights, per feature. Only with a ``feature_map``, as the other
-        attributes ``coef_...``. The axis of outputs is left out if y has one column or outputs share their weights.
+        Posterior means and standard deviations of the weights.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Posterior covariances of the weights.
     coef_names_ : ndarray of str of shape (n_h,)
-        Names of the features by ``get_feature_names_out`` of the feature map, or h0, h1, ...
+        Names of the features.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        Prior means and standard deviations of the weights. The latter are learned (see `CoefPrior`).
+        Prior means and standard deviations of the weights.
     coef_groups_ : ndarray of str of the shape of ``coef_``
-        Label of the group of each weight, or empty if its prior standard deviation is not learned.
+        Group of each weight (see `CoefPrior`).
     theta_, theta_std_ : dict of str to float
-        Posterior medians and standard deviations of the parameters of the feature map. Only if it has any, such as
-        `skevgp.features.ParametricFeatures`.
+        Posterior medians and standard deviations of the parameters of `skevgp.features.ParametricFeatures` and similar
+        maps.
     theta_cov_ : ndarray of shape (n_theta, n_theta)
-        Posterior covariance of the parameters, in the order of ``theta_``.
+        Posterior covariance of these parameters.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     kernel_ : Kernel, or list of Kernel for several outputs
@@ -112,17 +104,16 @@ class EGPRegressor(GaussianProcess):
     noise_variance_ : float or ndarray of shape (n_outputs,)
         Noise variance σ² in squared units of y.
     log_marginal_likelihood_value_ : float
-        Log marginal likelihood in nats, summed over outputs. With k vague weights it is that of n_samples - k contrasts
-        (Rasmussen & Williams 2006, eq. 2.45).
+        Log marginal likelihood in nats, summed over outputs. With vague weights, it is eq. 2.45 of Rasmussen & Williams
+        (2006).
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the log marginal likelihood per iteration. With learned scales of weights, it includes minus the log
-        prior density of their factors, ½ Σ log² t.
+        Minus the log marginal likelihood per iteration, plus minus the log prior density of learned scales of weights.
     n_iter_ : int
-        Number of iterations of the best start, or of evaluations of a callable ``optimizer``.
+        Number of iterations of the best start.
     n_features_in_ : int
         Number of columns of X.
     feature_names_in_ : ndarray of str
-        Names of the columns of X, if it had any.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
@@ -130,16 +121,9 @@ class EGPRegressor(GaussianProcess):
 
     Notes
     -----
-    Outputs that vary along different columns, or at different scales, fit better with kernels of their own:
-    ``MultiOutputRegressor(EGPRegressor(...))`` of scikit-learn, whose predictions have no std.
-
-    A callable ``optimizer(objective, theta, bounds=bounds) -> (theta, value)`` is called from each start. It minimises
-    minus the log marginal likelihood, ``objective(theta, eval_gradient=True) -> (value, gradient)``. The vector theta
-    (n_free,) has the logarithms of the free hyperparameters, then those of the signal variances and of the noise
-    variances of the outputs. The bounds (n_free, 2) are those of its entries.
-
-    `SelectFromModel` and `RFE` of scikit-learn rank columns of X, not features. For one output, the default kernel and
-    columns of similar scale, use ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``.
+    A callable ``optimizer(objective, theta, bounds=bounds) -> (theta, value)`` minimises ``objective(theta,
+    eval_gradient=True) -> (value, gradient)``. The vector theta has the logarithms of the free hyperparameters, of the
+    signal variances and of the noise variances.
 
     References
     ----------
@@ -147,7 +131,7 @@ class EGPRegressor(GaussianProcess):
 
     Examples
     --------
-    Learn a wave on an unknown linear trend, with the explicit features x and 1:
+    Learn a wave on an unknown linear trend:
 
     >>> import numpy as np
     >>> from sklearn.preprocessing import PolynomialFeatures
@@ -159,12 +143,10 @@ class EGPRegressor(GaussianProcess):
     >>> round(model.score(X, y), 2)
     0.96
 
-    Before a fit, predictions are those of the prior for a y of size one. Maps are then fitted to the rows of the
-    prediction:
+    Before a fit, predictions are those of the prior, for a y of size one:
 
     >>> prior = EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=[0.0, 2.0]))
-    >>> mean, std = prior.predict([[0.0], [3.0]], return_std=True)
-    >>> std.round(2)
+    >>> prior.predict([[0.0], [3.0]], return_std=True)[1].round(2)
     array([1.  , 6.08])
     """
 
@@ -236,13 +218,12 @@ class EGPRegressor(GaussianProcess):
         *,
         relative_variance: ArrayLike | None = None,
     ) -> Self:
-        """Fit kernel and noise; the posterior is exact.
+        """Fit kernel and noise. The posterior is exact.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Rows, with numbers up to 1e100. The maps get X as given: a data frame (pandas, polars, pyarrow) stays one,
-            and with a ``kernel_map`` it may hold words that the maps encode.
+            Rows, with numbers up to 1e100. The maps get X as given, for example as a data frame.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets, up to 1e100. The largest of a column must be 0 or above 1e-140.
         sample_weight, relative_variance : array-like of shape (n_samples,), default=None
@@ -262,12 +243,11 @@ class EGPRegressor(GaussianProcess):
         Warns
         -----
         ConvergenceWarning
-            If iterations or time were used up, or rounding errors or Ctrl-C ended them; the best parameters so far are
-            kept. If the Gaussian process learned nothing, y is far from its prior mean, or a parameter of the given
-            kernel is at a bound. The message gives advice.
+            If the fit ended before it converged. If the Gaussian process learned nothing, y is far from its prior mean,
+            or a parameter of the given kernel is at a bound. The message gives advice.
         """
         if is_dask(X):
-            raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
+            raise TypeError("X is a Dask array, but the exact model needs all rows in memory. Use EVGPRegressor.")
         progress = monitor_of(self.verbose, max_time=self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             data = Dataset.from_user(self, X, y, sample_weight, relative_variance)
@@ -320,8 +300,8 @@ class EGPRegressor(GaussianProcess):
         if self.alpha is not None:
             if spec.starts.noise.value is not None:
                 raise ValueError(
-                    f"alpha={self.alpha!r} is the noise, but a WhiteKernel or Gaussian(variance=...) says that it is "
-                    "to be learned; give one of them."
+                    f"alpha={self.alpha!r} fixes the noise, but a WhiteKernel or Gaussian(variance=...) asks to learn "
+                    "it. Pass one of them only."
                 )
             spec = spec.with_noise(self.alpha, fixed=True)
         return replace(problem, spec=spec, orthogonal=self.discrepancy == "orthogonal")
@@ -341,8 +321,8 @@ class EGPRegressor(GaussianProcess):
         problem = model._problem(data)
         if problem.vague.any():
             raise NotFittedError(
-                f"This {type(self).__name__} is not fitted yet, and with an infinite scale of CoefPrior nothing is "
-                "known before."
+                f"This {type(self).__name__} is not fitted yet. It predicts before a fit only if all scales of "
+                "CoefPrior are finite."
             )
         rows, spec, prior = problem.units.rows(data.source), problem.spec.as_given(), problem.units.prior
         model.kernel_map_ = data.maps.kernel_map
@@ -359,14 +339,15 @@ class EGPRegressor(GaussianProcess):
     ) -> Any:
         """Return the log marginal likelihood of the training data under another kernel, with the fitted noise.
 
-        It corresponds to that of `GaussianProcessRegressor`, in units of y also with ``normalize_y``.
+        The method corresponds to that of `GaussianProcessRegressor`. The result is in units of y, also with
+        ``normalize_y``.
 
         Parameters
         ----------
         theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
-            Logarithms of the free hyperparameters of each output, in the order of ``kernel_.theta``. A vector of the
-            length of ``kernel.theta``, of the kernel as given, is accepted too: a missing signal variance is then 1,
-            and its own noise is used. If None, the fitted hyperparameters.
+            Logarithms of the free hyperparameters of each output, in the order of ``kernel_.theta``. A vector in the
+            order of ``kernel.theta`` is accepted too. Then a missing signal variance is 1, and the noise is that of
+            ``theta``. If None, the fitted hyperparameters are used.
         eval_gradient : bool, default=False
             Whether to return the gradient too. It needs a ``theta``.
         clone_kernel : bool, default=True
@@ -375,10 +356,10 @@ class EGPRegressor(GaussianProcess):
         Returns
         -------
         log_likelihood : float
-            Log marginal likelihood in nats, as ``log_marginal_likelihood_value_``.
+            Log marginal likelihood in nats, like ``log_marginal_likelihood_value_``.
         gradient : ndarray of the shape of ``theta``
-            Gradient with respect to ``theta``. Only if ``eval_gradient``. Add up its rows for parameters that outputs
-            share.
+            Gradient with respect to ``theta``. It is returned only if ``eval_gradient`` is True. Add up its rows for
+            parameters that outputs share.
 
         Raises
         ------
@@ -392,7 +373,7 @@ class EGPRegressor(GaussianProcess):
             return self.log_marginal_likelihood_value_
         predictor = self._posterior.predictor
         if predictor.shared:
-            raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: not shared ones.")
+            raise ValueError("log_marginal_likelihood(theta) does not support weights that outputs share.")
         order, given, width = self._spec.order, self._spec.given_order, np.shape(theta)[-1:]
         # Fitted hyperparameters of k̃, s² and σ² of each output, in the user's units.
         fitted = [

@@ -51,136 +51,115 @@ class EVGPRegressor(GaussianProcess):
     The model of each output is
 
     .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
-              f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
+              f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2).
 
-    where the features h are known (approximate physics, a trend) and f, a Gaussian process with ``n_inducing`` inducing
-    points, learns the residual. Time is linear in the number of rows. Without a feature map it is the sparse Gaussian
-    process of Titsias (2009) and Hensman et al. (2013). See the user guide, :doc:`/guide/model`.
+    The features h are known, such as approximate physics or a trend. The Gaussian process f learns the residual with
+    ``n_inducing`` inducing points. Time is linear in the number of rows. Without a feature map, the model is the sparse
+    Gaussian process of Titsias (2009). See the user guide, :doc:`/guide/model`.
 
     Parameters
     ----------
     feature_map : transformer, default=None
         Transformer x -> h(x), for example `InertiaForceGravity("pendulum")`. It gets X as given, so do not scale the
-        columns of X. It may return a row for each output, (n, n_outputs, n_h).
+        columns of X. It may return a row for each output, of shape (n, n_outputs, n_h).
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f: one of the kernels that `skevgp.kernels` lists, sums and products of them, or a function in
-        autograd.numpy (`FunctionKernel`). The outermost constant factor is the signal variance of each output, and a
-        WhiteKernel in the outermost sum sets the noise. If None, an RBF with a length scale per column.
+        Covariance of f: sums and products of the kernels that `skevgp.kernels` lists, or a function in autograd.numpy
+        (`FunctionKernel`). If None, an RBF with a length scale for each column.
     kernel_map : transformer, default=None
-        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel gets its result, so scale
-        columns here. It may return a row for each output, (n, n_outputs, d).
+        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel gets its result.
     coef_prior : skevgp.CoefPrior or "auto", default="auto"
-        Prior of the weights β. If ``"auto"``, it is that of the feature map. See :doc:`/guide/priors`.
+        Prior of the weights β. If ``"auto"``, that of the feature map. See :doc:`/guide/priors`.
     n_inducing : int or "auto", default=100
-        Number of inducing points, at most the number of distinct rows. With L-BFGS, ``"auto"`` starts with 10 and adds
-        points until they raise the bound by less than 0.01 nats per row and output.
+        Number of inducing points. If ``"auto"``, it grows while this raises the bound. See
+        :doc:`/howto/inducing_points`.
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
-        Start of the inducing points: cluster centres, rows of the largest residual variance (``"greedy"``, Burt et al.
-        2020), or points in the space of ``kernel_map``. ``"auto"`` is ``"k-means"``, and with L-BFGS also tries
-        ``"greedy"`` after 25 iterations.
+        Start of the inducing points: cluster centres, rows of large residual variance (``"greedy"``), or points in the
+        space of ``kernel_map``. If ``"auto"``, L-BFGS tries both.
     sharing : {"auto", "all", "kernel", "none"} or list of list of int, default="auto"
-        Parameters that outputs share: inducing points and kernel shape (``"all"``, the fastest), kernel shape
-        (``"kernel"``, as in the paper), or none. Outputs in a group of ``[[0, 1], [2, 3]]`` share as in ``"all"``.
-        ``"auto"`` finds groups by short fits. See :doc:`/guide/sharing`.
+        Parameters that outputs share: inducing points and kernel shape (``"all"``), kernel shape (``"kernel"``), or
+        none. Lists are groups of outputs that share all. If ``"auto"``, short fits find groups. See
+        :doc:`/guide/sharing`.
     noise : {"gaussian", "student-t"}, `skevgp.noise.Gaussian` or `skevgp.noise.StudentT`, default="gaussian"
         Noise model. Use ``"student-t"`` if a few rows are outliers, and ``Gaussian(inputs=...)`` for noise in X.
     discrepancy : {"free", "orthogonal"}, default="free"
-        Whether f may imitate the features. If ``"orthogonal"``, f is orthogonal to them on the rows of X, so that
-        ``coef_`` is the best fit of the features to the noise-free g(x) in least squares. See :doc:`/guide/parameters`.
+        Whether f may imitate the features, or is orthogonal to them. See :doc:`/guide/parameters`.
     noise_cv : int, default=5
-        Number of folds that calibrate signal and noise variance after the iterations. Folds are whole ``groups`` of
-        `fit`, or random rows. If None, or with fewer than 50 rows, there is no calibration. See :doc:`/guide/noise`.
+        Number of folds that calibrate signal and noise variance. If None, there is no calibration. See
+        :doc:`/guide/noise`.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y instead of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
-        L-BFGS on the bound with q at its optimum, or Adam on mini-batches over all parameters, as in the paper. Solver
-        objects have further options, such as ``Adam(batch_size=1000)``. A grid search over a model with such an object
-        sets them as ``solver__batch_size``.
+        Optimiser: L-BFGS on all rows, or Adam on mini-batches. Solver objects have further options. See
+        :doc:`/guide/solvers`.
     max_iter : int, default=None
-        Maximum number of iterations of L-BFGS (None: 1000) or of steps of Adam (None: 16000). With 0, kernel and
-        inducing points stay at their start, and only q is fitted.
+        Maximum number of iterations. If None, 1000 for L-BFGS and 16000 for Adam.
     warm_start : bool, default=False
-        Whether to start from the kernel, noise, inducing points and groups of the last fit, if shapes agree.
+        Whether to start from the result of the last fit.
     n_jobs : int, default=None
-        Number of threads; None means 1, -1 all cores. The result does not depend on it.
+        Number of threads. If None, 1; if -1, all cores.
     random_state : int, RandomState instance or None, default=None
         Seed of inducing points, mini-batches and restarts.
     verbose : int, default=0
-        Verbosity: 0 prints nothing, 1 shows the progress, and 2 prints a line at each iteration. Progress is a live
-        line if tqdm is installed and the output is a terminal or a notebook, else a line every ten seconds.
+        Verbosity: 0 prints nothing, 1 shows the progress, and 2 prints a line at each iteration.
 
     Attributes
     ----------
     coef_, coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior means and standard deviations of the weights, per feature. Only with a ``feature_map``, as the other
-        attributes ``coef_...``. The axis of outputs is left out if y has one column or outputs share their weights.
+        Posterior means and standard deviations of the weights. They exist only with a ``feature_map``. The axis of
+        outputs is left out if y has one column or outputs share their weights.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Posterior covariances of the weights.
     coef_names_ : ndarray of str of shape (n_h,)
-        Names of the features by ``get_feature_names_out`` of the feature map, or h0, h1, ...
+        Names of the features.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        Prior means and standard deviations of the weights. The latter are learned (see `CoefPrior`).
+        Prior means and standard deviations of the weights.
     coef_groups_ : ndarray of str of the shape of ``coef_``
-        Label of the group of each weight, or empty if its prior standard deviation is not learned.
+        Group of each weight (see `CoefPrior`).
     theta_, theta_std_ : dict of str to float
-        Posterior medians and standard deviations of the parameters of the feature map. Only if it has any, such as
-        `skevgp.features.ParametricFeatures`.
+        Posterior medians and standard deviations of the parameters of `skevgp.features.ParametricFeatures` and similar
+        maps.
     theta_cov_ : ndarray of shape (n_theta, n_theta)
-        Posterior covariance of the parameters, in the order of ``theta_``.
+        Posterior covariance of these parameters.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     inducing_points_ : ndarray of shape (m, d) or, for several outputs unless all share them, (n_outputs, m, d)
-        Inducing points in the space of ``kernel_map``. With ``n_inducing="auto"``, a list of arrays if outputs have
-        different numbers of points.
+        Inducing points in the space of ``kernel_map``.
     sharing_ : list of list of int
         Groups of outputs that share a kernel.
     kernel_ : Kernel, or list of Kernel for several outputs
-        Fitted kernel without noise. ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
-        optimizer=None)`` is the exact counterpart.
+        Fitted kernel without noise.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         Noise variance σ² in squared units of y.
     weights_ : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-        Only with ``noise="student-t"``: the factor on the precision of each row, 1 for ordinary rows, near 0 for
-        outliers, and NaN for rows of weight 0. After `partial_fit`, those of the new rows.
+        Factor on the precision of each row: 1 for ordinary rows, and near 0 for outliers. It exists only with
+        ``noise="student-t"``.
     lower_bound_, upper_bound_ : float
-        Bounds on the log marginal likelihood at the fitted parameters, in nats, summed over outputs. If they agree,
-        more inducing points cannot improve the fit. The upper bound (Titsias 2014) is loose with many rows.
+        Bounds on the log marginal likelihood in nats, summed over outputs. If they agree, more inducing points cannot
+        improve the fit.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the lower bound per iteration; for Adam, minus its estimate by a mini-batch. With learned scales of
-        weights, it includes minus the log prior density of their factors, ½ Σ log² t.
+        Minus the lower bound per iteration.
     n_iter_ : int
         Number of iterations of the best start.
     n_parameters_ : int
-        Number of parameters of kernel, noise and inducing points that are not fixed, and of q.
+        Number of parameters that are fitted.
     n_features_in_ : int
         Number of columns of X.
     feature_names_in_ : ndarray of str
-        Names of the columns of X, if it had any.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
-    EGPRegressor : The same model without inducing points, exact, for a few thousand rows.
-    sklearn.gaussian_process.GaussianProcessRegressor : The exact GP without features.
-
-    Notes
-    -----
-    `SelectFromModel` and `RFE` of scikit-learn rank columns of X, not features. For one output, the default kernel and
-    columns of similar scale, use ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``.
-
-    Bounds are accurate to a few nats if features are collinear to 1e-9. With ``noise_cv``, ``lower_bound_`` is below
-    the bound of the last iteration, because the calibration changes the noise.
+    EGPRegressor : The same model without inducing points, for up to a few thousand rows.
+    sklearn.gaussian_process.GaussianProcessRegressor : The exact Gaussian process without features.
 
     References
     ----------
     - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes.
     - M. K. Titsias (2009): Variational Learning of Inducing Variables in Sparse Gaussian Processes.
-    - M. K. Titsias (2014): Variational Inference for Gaussian and Determinantal Point Processes.
-    - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
-    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
 
     Examples
     --------
-    Learn a wave on a linear trend, with the explicit features x and 1:
+    Learn a wave on a linear trend, with the explicit features 1 and x:
 
     >>> from sklearn.preprocessing import PolynomialFeatures
     >>> from skevgp import EVGPRegressor
@@ -190,22 +169,6 @@ class EVGPRegressor(GaussianProcess):
     >>> mean, std = model.predict(X, return_std=True)
     >>> round(model.score(X, y), 2)
     0.96
-
-    The torques of gravity in two joints are linear in the same two first moments, 20 and 5. Each joint has a row of
-    features:
-
-    >>> import numpy as np
-    >>> from sklearn.preprocessing import FunctionTransformer
-    >>> from skevgp import CoefPrior
-    >>> def gravity(X):
-    ...     own, both = np.sin(X[:, 0]), np.sin(X[:, 0] + X[:, 1])
-    ...     return np.stack([np.column_stack([own, both]), np.column_stack([0.0 * own, both])], axis=1)
-    >>> X = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
-    >>> y = gravity(X) @ [20.0, 5.0] + np.cos(2.0 * X)
-    >>> prior = CoefPrior(shared=True)
-    >>> model = EVGPRegressor(FunctionTransformer(gravity), coef_prior=prior, n_inducing=20, random_state=0).fit(X, y)
-    >>> model.coef_.round(1)
-    array([20.,  5.])
     """
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
@@ -285,20 +248,19 @@ class EVGPRegressor(GaussianProcess):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            Rows, with numbers up to 1e100. The maps get X as given: a data frame (pandas, polars, pyarrow) stays one,
-            and with a ``kernel_map`` it may hold words that the maps encode. Memory-mapped arrays of float64 or float32
-            are not copied. On Dask arrays, see :doc:`/howto/dask`.
+            Rows, with numbers up to 1e100. The maps get X as given, for example as a data frame. Memory-mapped arrays
+            of float64 or float32 are not copied. See :doc:`/howto/dask` on Dask arrays.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Targets, up to 1e100. The largest of a column must be 0 or above 1e-140.
         sample_weight : array-like or dask.array.Array of shape (n_samples,), default=None
-            Factor on the log likelihood of each row: 0 removes the row, 2 counts it twice. Maps whose ``fit`` has a
-            ``sample_weight`` get it too.
+            Factor on the log likelihood of each row: 0 removes the row, and 2 counts it twice. Maps get it too, if
+            their ``fit`` has a ``sample_weight``.
         groups : array-like of shape (n_samples,), default=None
             Labels of the trajectory of each row, such as ``make_dynamics(...).groups``. ``noise_cv`` then leaves out
             whole groups, so that ``std`` is valid for new trajectories. If None, rows are independent.
         relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
-            Known noise variance of each row in units of σ², the same for all outputs. With σ² fixed by
-            ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
+            Known noise variance of each row in units of σ², the same for all outputs. With ``WhiteKernel(1, "fixed")``
+            in the kernel, it is the ``alpha`` of GaussianProcessRegressor.
 
         Returns
         -------
@@ -310,14 +272,14 @@ class EVGPRegressor(GaussianProcess):
         ValueError, TypeError
             If an argument is out of its range, the data are not finite, or shapes do not fit.
         KeyboardInterrupt
-            Upon Ctrl-C before there are any parameters to keep.
+            If Ctrl-C is pressed before the fit has parameters to keep.
 
         Warns
         -----
         ConvergenceWarning
-            If iterations or time were used up, or rounding errors or Ctrl-C ended them; the best parameters so far are
-            kept. If the Gaussian process learned nothing, or nothing that is valid for left-out groups. If y is far
-            from its prior mean, or a parameter of the given kernel is at a bound. The message gives advice.
+            If the fit ended before it converged, or the Gaussian process learned nothing that holds for left-out
+            groups. If y is far from its prior mean, or a parameter of the given kernel is at a bound. The message gives
+            advice.
         skevgp.exceptions.DependentRowsWarning
             If neighbouring rows depend on each other and ``groups`` is not given.
 
@@ -325,13 +287,7 @@ class EVGPRegressor(GaussianProcess):
         -----
         If one group has half of the rows or more, ``noise_cv`` leaves out blocks of successive rows of a group.
 
-        Chunks of a Dask array stay on their workers, and are read again at each pass without a
-        ``dask.distributed.Client``. Maps get chunks: they are fitted by ``partial_fit`` if they have it, else to 10,000
-        rows spread over X. Rows of weight 0 are removed before the maps are fitted, except from a Dask array.
-
-        `DependentRowsWarning` is given if the noise would be more than four times as large with blocks of rows left
-        out. It is also given if rows follow a path, and their log density would be lower by 0.1. Rows follow a path if
-        two directions of the kernel's inputs change slowly, and none is sorted.
+        See :doc:`/guide/noise` on the rules of `DependentRowsWarning`.
         """
         solver, noise = as_solver(self.solver), as_noise(self.noise)
         self._check_together(solver, noise, X)
@@ -383,7 +339,7 @@ class EVGPRegressor(GaussianProcess):
         relative_variance: ArrayLike | None = None,
         forgetting_factor: float = 1.0,
     ) -> Self:
-        """Add new rows to the posterior exactly, with the same kernel, noise and inducing points.
+        """Add new rows to the posterior exactly. Kernel, noise and inducing points stay the same.
 
         The first call is a `fit`. After Adam, q moves to its optimum. If the noise variance is below 1e-8 of the signal
         variance, ``lower_bound_`` and ``upper_bound_`` are accurate to about a nat. Features with parameters stay
@@ -399,8 +355,8 @@ class EVGPRegressor(GaussianProcess):
         sample_weight, relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
             Weights and relative noise variances of the new rows, as for `fit`.
         forgetting_factor : float, default=1.0
-            Factor on the log likelihood of all earlier rows, in (0, 1], for a system that drifts. With 1 nothing is
-            forgotten; 0.99 remembers about the last hundred calls.
+            Factor on the log likelihood of all earlier rows, in (0, 1]. Use a factor below 1 for a system that drifts:
+            0.99 remembers about the last hundred calls.
 
         Returns
         -------
@@ -421,8 +377,8 @@ class EVGPRegressor(GaussianProcess):
         noise = as_noise(self.noise)
         if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
             raise ValueError(
-                f"With noise={self.noise!r}, partial_fit needs rows in memory or in a file, and forgetting_factor=1 (a "
-                f"change of the system would look like outliers); got forgetting_factor={forgetting_factor!r}."
+                f"With noise={self.noise!r}, partial_fit needs rows in memory or in a file, and forgetting_factor=1; "
+                f"got forgetting_factor={forgetting_factor!r}."
             )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             maps, fitted = self._posterior.maps, self._fitted
@@ -513,7 +469,7 @@ class EVGPRegressor(GaussianProcess):
         except ValueError as error:
             words = words_of(data.given) if is_frame(data.given) else []
             which = f" The columns {words} are not numbers." if words else ""
-            raise ValueError(f"inputs of Gaussian noise needs numbers in X, none of them missing.{which}") from error
+            raise ValueError(f"inputs of Gaussian noise needs numbers in X without missing values.{which}") from error
 
     def _set_attributes(self, fitted: Fitted, data: Dataset) -> None:
         points = [group.points for group in self._posterior.predictor.by_output]

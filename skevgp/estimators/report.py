@@ -68,7 +68,7 @@ class FeatureGroup(NamedTuple):
 
 @dataclass(frozen=True)
 class FeatureReport:
-    """Whether explicit features help, as returned by `feature_report`.
+    """Report on whether explicit features help, as returned by `feature_report`.
 
     ``print`` shows it as text, and a notebook as a table.
 
@@ -77,7 +77,7 @@ class FeatureReport:
     groups : tuple of FeatureGroup
         One for each group of weights, and one for all features together.
     held_out : str
-        What was held out: "trajectories", "rows" or "" (nothing).
+        Kind of the held-out data: "trajectories", "rows" or "" (none).
 
     See Also
     --------
@@ -150,23 +150,23 @@ def feature_report(
 ) -> FeatureReport:
     """Report whether the explicit features of a model help, for each group of weights.
 
-    With X and y, the model is fitted again without each group, and predicts held-out rows. It then has its own kernel,
-    noise and inducing points, so that the Gaussian process may learn what the features explained.
+    With X and y, the model is fitted again without each group, and predicts held-out rows. Each fit has its own kernel,
+    noise and inducing points. Thus the Gaussian process can replace the features that are left out.
 
     Parameters
     ----------
     model : EVGPRegressor or EGPRegressor
         Fitted regressor with a ``feature_map``.
     X : array-like of shape (n_samples, n_features), default=None
-        Rows to fit and to hold out, for example the training data. If None, the report has only priors and posteriors.
+        Rows to fit and to hold out, for example the training data. If None, the report has priors and posteriors only.
     y : array-like of shape (n_samples,) or (n_samples, n_outputs), default=None
         Targets.
     groups : array-like of shape (n_samples,), default=None
         Labels of the trajectory of each row. Whole trajectories are then held out. If None, rows are independent.
     n_splits : int, default=3
-        Number of folds. There are as many fits for each group, and as many for the whole model.
+        Number of folds. Each fold has a fit for each group, and one for the whole model.
     n_jobs : int, default=None
-        Number of fits in parallel processes. None means 1, and -1 all cores.
+        Number of fits in parallel processes. If None, 1; if -1, all cores.
     random_state : int, RandomState instance or None, default=0
         Seed of the folds of rows without ``groups``.
 
@@ -191,13 +191,15 @@ def feature_report(
 
     Notes
     -----
-    A feature that is left out has the weight 0. Weights without a label are in the group "features". The loss is the
-    mean over held-out trajectories of the log density per row, summed over outputs, with the group minus without. Its
-    standard error is that of the mean over trajectories, or over rows without ``groups``. The group helps or hurts if
-    the losses differ from 0 by Wilcoxon's signed-rank test at the level 0.05, and by 0.01 nats. Otherwise it does
-    nothing if the mean loss is within 0.05 nats of 0 by two standard errors, and the verdict is "unclear" if not, or
-    if mean and median of the losses have different signs. The test needs at least six trajectories. Rows have weight 1,
-    and with `skevgp.noise.StudentT` the density of a Student-t with 4 degrees of freedom.
+    A feature that is left out has the weight 0. Weights without a label are in the group "features".
+
+    The loss of a group is the log density per held-out row with the group, minus that without it. It is summed over
+    outputs and averaged over trajectories, or over rows without ``groups``.
+
+    A group helps or hurts if the losses differ from 0 by Wilcoxon's signed-rank test at the level 0.05, and by 0.01
+    nats. The test needs at least six trajectories. Otherwise the group does nothing if the mean loss is within 0.05
+    nats of 0 by two standard errors. In all other cases the verdict is "unclear", and also if mean and median of the
+    losses have different signs.
 
     Examples
     --------

@@ -62,18 +62,18 @@ def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
 class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
     """Fit a regressor to the difference of y and some columns of X, and predict the sum.
 
-    For x = (state, input) and y the next state, the regressor learns the change of the state. In the paper this is
-    RES-VGP and RES-DBNN. The uncertainty of the change is that of the sum.
+    For x = (state, input) and y = next state, the regressor learns the change of the state. The paper calls this
+    RES-VGP and RES-DBNN. The sum has the uncertainty of the change.
 
     Parameters
     ----------
     regressor : estimator
-        Regressor, of which a clone is fitted to all columns of X. Scale columns and encode angles inside of it, as in
-        ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``. Before it, they would change the base
-        columns too.
+        Regressor, of which a clone is fitted to all columns of X. Scale columns and encode angles inside of the
+        regressor, as in ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``. Base columns then stay as
+        they are.
     base : int, str or array-like of shape (n_outputs,), default=None
-        Column of X that is subtracted from each output, by its index, or by its name if X is a data frame. If None, the
-        first ``n_outputs`` columns.
+        Column of X that is subtracted from each output, by its index, or by its name in a data frame. If None, the
+        first ``n_outputs`` columns are subtracted.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
     n_features_in_ : int
         Number of columns of X.
     feature_names_in_ : ndarray of str
-        Names of the columns of X, if it had any.
+        Names of the columns of X, if it has any.
 
     References
     ----------
@@ -125,8 +125,8 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets in units of their base columns.
         **params : dict
-            Arguments for ``fit`` of the regressor, such as ``sample_weight``. With metadata routing, those that it
-            requests.
+            Arguments for ``fit`` of the regressor, such as ``sample_weight``. With metadata routing, the regressor gets
+            those that it requests.
 
         Returns
         -------
@@ -169,7 +169,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
             return self._fit("partial_fit", X, y, params)
 
     def predict(self, X: ArrayLike, **params: Any) -> Any:
-        """Predict y: the base columns plus what the regressor predicts.
+        """Predict y: the base columns plus the prediction of the regressor.
 
         Parameters
         ----------
@@ -308,8 +308,8 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         if self.base is None:
             if n_outputs > self.n_features_in_:
                 raise ValueError(
-                    f"base=None takes the first n_outputs={n_outputs} columns of X, which has {self.n_features_in_}; "
-                    "give base the column from which each output starts."
+                    f"base=None takes the first n_outputs={n_outputs} columns of X, which has {self.n_features_in_}. "
+                    "Pass base=..., the column that is subtracted from each output."
                 )
             return np.arange(n_outputs)
         columns = np.atleast_1d(np.asarray(self.base, dtype=object))

@@ -16,31 +16,32 @@ from .robot_map import RobotTransformer
 
 
 class AngleEncoder(RobotTransformer):
-    """Replace each angle by its sine and cosine; other columns stay as they are.
+    """Replace each angle by its sine and cosine, and keep all other columns.
 
-    Pass it as the ``kernel_map`` of a regressor. A kernel of (sin q, cos q) has the same value at q and q + 2π, and
-    nearby angles on both sides of a full turn are close to each other.
+    Pass it as the ``kernel_map`` of a regressor. A kernel of (sin q, cos q) has the same value at q and q + 2π. Thus
+    angles on both sides of a full turn are close to each other.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        Robot as in `skevgp.datasets.load_robot`. X then has the columns [q, q̇, u]. If None, X may have any number of
+        Robot, as in `skevgp.datasets.load_robot`. X then has the columns [q, q̇, u]. If None, X may have any number of
         columns.
     angles : sequence of int or str, default=None
-        Columns that are angles in rad, by index or by name: of a column of the data frame, or of a position of the
-        robot. If None, all revolute positions of the robot.
+        Columns that are angles in rad, by index or by name. A name is that of a column of the data frame, or of a
+        position of the robot. If None, all revolute positions of the robot.
     dt : "column" or None, default=None
-        If ``"column"``, X has an additional last column, the time step of each row in seconds. It stays as it is.
+        Time step. If ``"column"``, the last column of X is the time step of each row in seconds. It stays as it is.
 
     Attributes
     ----------
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     Notes
     -----
-    Sine and cosine replace the angle, in this order. Scale after encoding:
+    Sine and cosine replace the angle, in this order. To scale columns, scale after the encoding, as in
     ``make_pipeline(AngleEncoder("acrobot"), StandardScaler())``.
 
     Examples
@@ -86,7 +87,7 @@ class AngleEncoder(RobotTransformer):
         Raises
         ------
         ValueError
-            If X has another number of columns, or holds NaN or infinity.
+            If X has another number of columns, or contains NaN or infinity.
         """
         check_is_fitted(self)
         encoded = check_array(X, dtype=np.float64)

@@ -28,53 +28,53 @@ SMALLEST_RATIO, LARGEST_POWER = 1e-100, 700.0
 
 
 class Friction(ParametricMap, RobotMap):
-    r"""Friction of each joint as features of its velocity, with velocities and sharpness that can be learned.
+    r"""Friction of each joint as features of its velocity.
 
     The features of a joint with velocity :math:`v = \dot q` are
 
     .. math:: v, \qquad \tanh(v / v_s), \qquad \tanh(v / v_s)\,\exp(-(|v| / v_S)^\delta)
 
     for viscous friction, Coulomb friction, and the higher friction at low speed (Stribeck effect). Join them to
-    `InertiaForce` or `NominalDynamics`. The weights learn how much each term decelerates the joints.
+    `InertiaForce` or `NominalDynamics`. The weights are the decelerations by each term.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
-        If None, X passes through and the weights get the regressor's wide default prior.
+        Robot, as in `skevgp.datasets.load_robot`. If None, X passes through, and the weights get the wide default prior
+        of the regressor.
     terms : sequence of str, default=("viscous", "coulomb", "stribeck")
-        Groups of columns with one column per joint, in the given order.
+        Groups of columns, with one column for each joint.
     stiction_velocity : float or array-like of shape (n_joints,), default=0.01
-        v_s in rad/s or m/s, for all joints or for each. Friction changes its sign smoothly within it. Above 0.
+        Velocity v_s in rad/s or m/s, above 0. Friction changes its sign smoothly within it.
     stribeck_velocity : float or array-like of shape (n_joints,), default=0.1
-        v_S in rad/s or m/s. The Stribeck effect has decreased to 37 % at this speed. Above 0.
+        Velocity v_S in rad/s or m/s, above 0, at which the Stribeck effect has decreased to 37 %.
     sharpness : float or array-like of shape (n_joints,), default=2.0
-        Exponent δ of the Stribeck effect. Above 0, typically from 0.5 to 2.
+        Exponent δ of the Stribeck effect, above 0. Typical values are from 0.5 to 2.
     dt : float or "column", default=0.03
-        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, features are
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row. Features are
         multiplied by it, and weights are rates.
     outputs : sequence of int or str, default=None
-        States in the columns of y, by index or name. If None, all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all states [q, q̇].
     unknown_ratio : float, default=1.0
-        Prior standard deviation of what a feature contributes to the velocity of its own joint, as a multiple of the
-        change that the prior mean of all features leaves.
+        Prior standard deviation of the contribution of a feature to the velocity of its joint, in units of the residual
+        of the prior mean.
     coupling_ratio : float, default=0.3
-        The same for the velocities of other joints, which friction changes through the mass matrix, as a share of
-        ``unknown_ratio``. With 0 these weights stay 0.
+        Prior standard deviation of the contribution to the velocities of other joints, as a share of ``unknown_ratio``.
+        If 0, these weights stay 0.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
-        Priors of unknown numbers, instead of ``stiction_velocity``, ``stribeck_velocity`` and ``sharpness``. Names are
-        those of the arguments for one number of all joints, or with the joint in brackets, such as
-        ``{"sharpness": Uniform(0.5, 2.5), "stribeck_velocity(elbow)": LogNormal(0.1, 0.5)}``. The regressor learns
-        their values. If None, all numbers are as given.
+        Priors of unknown numbers, such as ``{"sharpness": Uniform(0.5, 2.5)}`` for all joints or
+        ``{"stribeck_velocity(elbow)": LogNormal(0.1, 0.5)}`` for one. They replace ``stiction_velocity``,
+        ``stribeck_velocity`` and ``sharpness``. The regressor learns their values. If None, all numbers are as given.
 
     Attributes
     ----------
     theta_ : dict of str to float
-        Values that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
-        ``feature_map_`` of a fitted regressor, they are those of the posterior.
+        Values that ``transform`` uses. `fit` sets the prior medians, and a regressor sets the posterior medians in its
+        ``feature_map_``.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
@@ -83,9 +83,8 @@ class Friction(ParametricMap, RobotMap):
 
     Notes
     -----
-    Weights of velocities have mean 0, and the prior standard deviations for a position are Δt times those for its
-    velocity. Do not scale the columns of X before this map. Scale in the ``kernel_map`` of the regressor, which only
-    the kernel uses.
+    The weights have mean 0. Prior standard deviations for a position are Δt times those for its velocity. Do not scale
+    the columns of X before this map. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
 
     References
     ----------

@@ -153,51 +153,46 @@ class LinkGravity(OffsetAngles, GravityMap):
 
     The features of a link i with a revolute joint are
 
-    .. math:: (u_x \times R_i^\top g) \cdot u_z, \qquad (u_y \times R_i^\top g) \cdot u_z
+    .. math:: (u_x \times R_i^\top g) \cdot u_z, \qquad (u_y \times R_i^\top g) \cdot u_z.
 
-    (the paper's section III-B has the first). Here :math:`R_i` is the rotation of the link by forward kinematics,
-    :math:`g` the gravity vector of the model and :math:`u_z` the joint's axis in its own frame. A prismatic joint has
-    one feature, gravity along its axis, :math:`u_z \cdot R_i^\top g`. All features are in m/s². The weights learn the
-    mass and the centre of mass of the link.
+    Here :math:`R_i` is the rotation of the link, :math:`g` is the gravity vector, and :math:`u_z` is the axis of the
+    joint in its own frame. A prismatic joint has one feature, gravity along its axis. All features are in m/s². The
+    weights learn the mass and the centre of mass of the link. See the user guide, :doc:`/guide/priors`.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model, default=None
-        A named system (``"iiwa14"``, ``"acrobot"``, ...) or any other robot as in `skevgp.datasets.load_robot`. If
-        None, X passes through and the weights get the regressor's wide default prior.
+        Robot, as in `skevgp.datasets.load_robot`. If None, X passes through, and the weights get the wide default prior
+        of the regressor.
     axes : {"xy", "x"}, default="xy"
-        The levers: both :math:`u_x` and :math:`u_y`, which represent any centre of mass, or :math:`u_x` alone (the
-        formula of the paper).
+        Levers: :math:`u_x` and :math:`u_y`, which represent any centre of mass, or :math:`u_x` alone, as in the paper.
     links : sequence of int or str, default=None
-        The links, by the name of their joint or its index from 0 (the paper counts from 1). If None, all links.
+        Links, by the name of their joint or its index from 0. If None, all links.
     outputs : sequence of int or str, default=None
-        States in the columns of y, by index or name. If None, all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all states [q, q̇].
     inverse_length : float, default=3.0
-        Prior standard deviation of 1/l in 1/m, with the effective length l of a pendulum that the link would be. The
-        weights for the velocities of the joints between the base and the link are Δt times 1/l.
+        Prior standard deviation of 1/l in 1/m, with the length l of a pendulum equivalent to the link.
     unknown_ratio : float, default=1.0
-        Largest prior standard deviation of what a feature contributes, as a multiple of the change of the velocity that
-        the prior mean of all features leaves. Motors that hold an arm leave little of gravity to see.
+        Largest prior standard deviation of the contribution of a feature to a velocity, in units of the residual of the
+        prior mean.
     coupling_ratio : float, default=0.3
-        The same for the velocities of other joints, which the pull moves through the mass matrix, as a share of that.
-        With 0 these weights stay 0.
+        Prior standard deviation of the contribution to the velocities of other joints, as a share of that.
     dt : float, "column" or None, default=None
-        Time step Δt of the data in s, which only the prior needs. If None, it is not known: 0.03 s limits the pull, and
-        positions do not follow from velocities. If ``"column"``, X has a last column, the time step of each row, and
-        features are multiplied by it. Weights are then rates (1/m for a lever).
+        Time step Δt of the data in s, for the prior. If ``"column"``, the last column of X is the time step, and
+        weights are rates. If None, it is unknown.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
-        Priors of unknown offsets of angles in rad, such as ``{"offset(q1)": Normal(0.0, 0.05)}`` for the position
-        ``q1``. Gravity is computed for the angle in X plus the offset: the zero error of an encoder. Each position of a
-        revolute joint may have one. The regressor learns their values. If None, angles are as in X.
+        Priors of unknown offsets of angles in rad, such as ``{"offset(q1)": Normal(0.0, 0.05)}``. The regressor learns
+        the offsets. If None, angles are as in X.
 
     Attributes
     ----------
     theta_ : dict of str to float
-        Offsets that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
-        ``feature_map_`` of a fitted regressor, they are those of the posterior.
+        Offsets that ``transform`` uses. `fit` sets the prior medians, and a regressor sets the posterior medians in its
+        ``feature_map_``.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
@@ -205,18 +200,10 @@ class LinkGravity(OffsetAngles, GravityMap):
 
     Notes
     -----
-    :math:`(u_x, u_y, u_z)` is right-handed. :math:`u_x` is the coordinate axis that follows the largest component of
-    :math:`u_z` (x follows z, y follows x, z follows y) made orthogonal to :math:`u_z`; for a joint that turns about z
-    the levers are its frame's x and y.
+    The torque of gravity at a joint is linear in the features of its link if all later joints turn about parallel axes.
 
-    The torque of gravity at a joint is linear in the features of its link if all later joints turn about parallel axes:
-    at the last joint of any arm, and at every joint of a planar arm. At other joints it is not, because a later link
-    acts about an axis that turns in the frame of the link.
-
-    Features of a link whose axis is always vertical, such as the first link of most arms, are 0.
-
-    X has all columns [q, q̇, u]; only q is used, and Δt if it is a column. Do not scale the columns of X before this
-    map. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
+    X has all columns [q, q̇, u], of which only q is used. Do not scale the columns of X before this map. Scale in the
+    ``kernel_map`` of the regressor, which only the kernel uses.
 
     Examples
     --------
@@ -235,13 +222,6 @@ class LinkGravity(OffsetAngles, GravityMap):
     >>> union = FeatureUnion([("inertia", InertiaForce("iiwa14")), ("gravity", LinkGravity("iiwa14", axes="x"))])
     >>> union.fit_transform(np.zeros((1, 21))).shape
     (1, 28)
-
-    An encoder whose zero is known to 0.05 rad:
-
-    >>> from skevgp.features import Normal
-    >>> features = LinkGravity("pendulum", parameters={"offset(q)": Normal(0.0, 0.05)}).fit([[0.0, 0.0, 1.0]])
-    >>> features.theta_
-    {'offset(q)': 0.0}
     """
 
     def __init__(

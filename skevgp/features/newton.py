@@ -75,61 +75,55 @@ class InertiaForce(_NewtonFeatures):
 
     .. math:: q' = q + \Delta t\,\dot q, \qquad \dot q' = \dot q + \gamma u, \qquad \gamma = \Delta t / J,
 
-    with :math:`\gamma` on the driven joints.
+    with :math:`\gamma` on the driven joints. See the user guide, :doc:`/guide/priors`.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model, default=None
-        A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
-        If None, X passes through and the weights get the regressor's wide default prior.
+        Robot, as in `skevgp.datasets.load_robot`. If None, X passes through, and the weights get the wide default prior
+        of the regressor.
     dt : float or "column", default=0.03
-        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights are
-        rates (see Notes).
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row (see Notes).
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     outputs : sequence of int or str, default=None
-        States in the columns of y, by index or name. If None, all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all states [q, q̇].
     known_rate : float, default=0.3
-        Prior standard deviation of the weights that Newton's law gives, as a rate in 1/s: the weight of a velocity for
-        itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
+        Prior standard deviation of the weights that Newton's law gives, in 1/s. The weight of a velocity for itself is
+        1 ± ``known_rate`` Δt.
     unknown_ratio : float, default=1.0
-        Prior standard deviation of what an input contributes to the velocity of its own joint, as a multiple of the
-        change that the prior mean of all features leaves (see Notes).
+        Prior standard deviation of the contribution of an input to the velocity of its joint. It is in units of the
+        residual of the prior mean (see Notes).
     coupling_ratio : float, default=0.3
-        The same for inputs at other joints, which act through the mass matrix, as a share of ``unknown_ratio``. With 0
+        Prior standard deviation of the contribution of inputs at other joints, as a share of ``unknown_ratio``. If 0,
         these weights stay 0.
     other_ratio : float, default=0.003
-        Prior standard deviation of what all other features contribute, as a multiple of the same change. These weights
-        are 0 in Newton's law, or the 1 of a position for itself. With 0 they stay at their mean.
+        Prior standard deviation of the contribution of all other features, in units of the same residual. If 0, their
+        weights stay at their mean.
 
     Attributes
     ----------
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
-    InertiaForceGravity : Adds gravity.
+    InertiaForceGravity : The same features with gravity.
 
     Notes
     -----
-    A standard deviation that is given as a ratio is in units of the data, and fits any robot and time step: it is the
-    ratio times rms(y - h(x)ᵀμ) / rms(feature), where μ is the prior mean of the weights of all features. The prior
-    standard deviations for a position are Δt times those for its velocity. If y has a position without its velocity,
-    they follow from what the prior mean leaves of the position.
+    A ratio becomes a standard deviation by the factor rms(y - h(x)ᵀμ) / rms(feature), where μ is the prior mean of all
+    weights. Thus it fits any robot and time step. Standard deviations for a position are Δt times those for its
+    velocity. The scale of each group of weights is then learned with the kernel (see `skevgp.CoefPrior`).
 
-    The scale of each group of weights (``"known"``, ``"input"``, ``"coupling"`` and ``"other"``) is then learned with
-    the kernel, for each output (see ``groups`` of `skevgp.CoefPrior`).
-
-    Do not scale the columns of X before this map, because Euler's rule holds only if velocities are the derivatives of
+    Do not scale the columns of X before this map, because Euler's rule needs velocities that are derivatives of
     positions. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
 
     With ``dt="column"`` the features are :math:`[z, \Delta t\,z, \Delta t\,u]` with the state :math:`z = [q, \dot q]`,
-    for :math:`z' = z + \Delta t\,(A z + B u)`. The weights of z are fixed to 1 and 0. All others are rates in SI units
-    and the same for any Δt: 1 for :math:`\dot q` in the rows of positions, ``inverse_inertia`` for u, and 0. For Δt in
-    the prior standard deviations, the mean of the column in `fit` is used. Euler's rule neglects ½ Δt times the second
-    derivative, which biases the weights. Short steps identify physics best.
+    for :math:`z' = z + \Delta t\,(A z + B u)`. The weights of z are fixed to 1 and 0. All other weights are rates in SI
+    units. Euler's rule neglects a term in Δt², so short steps identify physics best.
 
     Examples
     --------
@@ -151,9 +145,6 @@ class InertiaForce(_NewtonFeatures):
            [0.1  , 1.   , 0.002, 0.02 , 0.04 ]])
     >>> features.get_feature_names_out().tolist()
     ['q', 'dq/dt', 'dt * q', 'dt * dq/dt', 'dt * u_q']
-    >>> features.coef_prior(n_outputs=2)[0]
-    array([[1., 0., 0., 1., 0.],
-           [0., 1., 0., 0., 4.]])
     """
 
     def __init__(
@@ -190,76 +181,66 @@ class InertiaForce(_NewtonFeatures):
 class InertiaForceGravity(OffsetAngles, _NewtonFeatures):
     r"""Inertia + force + gravity features (IFG): those of `InertiaForce` and the pull of gravity on each link.
 
-    For a planar system of the paper :math:`h(x) = [q, \dot q, u, \sin(\cdot)]` (its eq. gravity_prior and section
-    III-B), with the sine of each link's angle against the vertical: :math:`\sin q` (pendulum), :math:`\sin\theta`
-    (cartpole), :math:`\sin q_1` and :math:`\sin(q_1 + q_2)` (acrobot). Other robots have the features of `LinkGravity`
-    instead of sines. Gravity decelerates a link by its gain times the feature.
+    For the pendulum, the cartpole and the acrobot, h(x) is :math:`[q, \dot q, u, \sin(\cdot)]` with the sine of the
+    angle of each link against the vertical. Other robots have the features of `LinkGravity` instead of sines. See the
+    user guide, :doc:`/guide/priors`.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model, default=None
-        A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
-        If None, the sine of every column is added and the weights get the regressor's wide default prior.
+        Robot, as in `skevgp.datasets.load_robot`. If None, the sine of every column is added, and the weights get the
+        wide default prior of the regressor.
     dt : float or "column", default=0.03
-        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights are
-        rates (see Notes).
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row (see the Notes
+        of `InertiaForce`).
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     gravity : LinkGravity, default=None
-        Other features of gravity, with their own ``inverse_length`` and ``coupling_ratio``. If None, the sines for the
-        pendulum, cartpole and acrobot, and for other robots `LinkGravity` of all links whose features are not always 0.
+        Features of gravity. If None, sines for the three systems above, and otherwise `LinkGravity` of all links whose
+        features are not always 0.
     gravity_gain : float or array-like of shape (n_terms,) or (n_joints, n_terms), default=0.0
-        Guess of the deceleration by gravity per unit of each feature: one for all, one per feature, or one per joint
-        and feature, where entries of joints that the feature does not accelerate are ignored. For a sine it is in
-        rad/s² (g/l for a point mass), for a lever of `LinkGravity` in 1/m (1/l for a point mass at -l times the lever).
+        Guess of the deceleration by gravity per unit of each feature. For a point mass at distance l, it is g/l
+        (rad/s²) for a sine, and 1/l (1/m) for `LinkGravity`.
     outputs : sequence of int or str, default=None
-        States in the columns of y, by index or name. If None, all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all states [q, q̇].
     known_rate : float, default=0.3
-        Prior standard deviation of the weights that Newton's law gives, as a rate in 1/s: the weight of a velocity for
-        itself is 1 ± ``known_rate`` Δt. Viscous damping of c/J changes it by c/J Δt.
+        Prior standard deviation of the weights that Newton's law gives, in 1/s, as in `InertiaForce`.
     inverse_length : float, default=3.0
-        Prior standard deviation of 1/l in 1/m, with the effective length l of a pendulum that a link would be. Gravity
-        decelerates the joints that it pulls by g/l times a sine, or by 1/l times a feature of `LinkGravity`. In units
-        of the data, its contribution has at most the standard deviation ``unknown_ratio``.
+        Prior standard deviation of 1/l in 1/m, with the length l of a pendulum equivalent to a link. ``unknown_ratio``
+        limits the contribution of gravity.
     unknown_ratio : float, default=1.0
-        Prior standard deviation of what an input contributes to the velocity of its own joint, as a multiple of the
-        change that the prior mean of all features leaves (see the Notes of `InertiaForce`). With 0, inputs keep their
-        guesses, and gravity too.
+        Prior standard deviation of the contribution of an input, as in `InertiaForce`.
     coupling_ratio : float, default=0.3
-        The same for inputs and gravity at other joints, which act through the mass matrix, as a share of the standard
-        deviations above. With 0 these weights stay 0.
+        Prior standard deviation of the contribution of inputs and gravity at other joints, as a share of the standard
+        deviations above.
     other_ratio : float, default=0.003
-        Prior standard deviation of what all other features contribute, as a multiple of the same change. These weights
-        are 0 in Newton's law, or the 1 of a position for itself. With 0 they stay at their mean.
+        Prior standard deviation of the contribution of all other features, as in `InertiaForce`.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
-        Priors of unknown offsets of angles in rad, such as ``{"offset(q)": Normal(0.0, 0.05)}`` for the position ``q``.
-        Gravity is computed for the angle in X plus the offset: the zero error of an encoder. Each position of a
-        revolute joint may have one. The regressor learns their values. If None, angles are as in X.
+        Priors of unknown offsets of angles in rad, such as ``{"offset(q)": Normal(0.0, 0.05)}``. Gravity is computed
+        for the angle in X plus the offset. The regressor learns the offsets. If None, angles are as in X.
 
     Attributes
     ----------
     theta_ : dict of str to float
-        Offsets that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
-        ``feature_map_`` of a fitted regressor, they are those of the posterior.
+        Offsets that ``transform`` uses. `fit` sets the prior medians, and a regressor sets the posterior medians in its
+        ``feature_map_``.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
-    InertiaForce : Without gravity.
-    LinkGravity : Gravity on links in 3D, alone.
+    InertiaForce : The same features without gravity.
+    LinkGravity : Gravity on links in 3D, without other features.
 
     Notes
     -----
-    Do not scale the columns of X before this map, because the sine of a scaled angle is not gravity. Scale in the
-    ``kernel_map`` of the regressor, which only the kernel uses.
+    Do not scale the columns of X before this map. Scale in the ``kernel_map`` of the regressor, which only the kernel
+    uses.
 
-    See the Notes of `InertiaForce` on prior standard deviations. The groups of weights whose scales are learned are
-    ``"known"``, ``"input"``, ``"gravity"``, ``"coupling"`` and ``"other"``.
-
-    With ``dt="column"``, see the Notes of `InertiaForce`, too. Features of gravity are multiplied by Δt, and the mean
-    of their weights is minus ``gravity_gain``.
+    See the Notes of `InertiaForce` on prior standard deviations and on ``dt="column"``. The mean of the weights of
+    gravity is minus ``gravity_gain``, times Δt unless ``dt="column"``.
 
     Examples
     --------
@@ -280,15 +261,6 @@ class InertiaForceGravity(OffsetAngles, _NewtonFeatures):
     >>> arm = InertiaForceGravity("iiwa14").fit([[0.0] * 21])
     >>> arm.get_feature_names_out()[21:24].tolist()
     ['gravity(q2, u_x)', 'gravity(q2, u_y)', 'gravity(q3, u_x)']
-
-    Rows of a log with irregular time steps, each with the time until the next row:
-
-    >>> logged = InertiaForceGravity("pendulum", dt="column", inverse_inertia=4.0, gravity_gain=20.0)
-    >>> logged.fit([[0.1, 0.0, 1.0, 0.008]]).get_feature_names_out().tolist()
-    ['q', 'dq/dt', 'dt * q', 'dt * dq/dt', 'dt * u_q', 'dt * sin(q)']
-    >>> logged.coef_prior(n_outputs=2)[0]
-    array([[  1.,   0.,   0.,   1.,   0.,   0.],
-           [  0.,   1.,   0.,   0.,   4., -20.]])
     """
 
     def __init__(

@@ -28,64 +28,59 @@ _MOVE = 0.5
 
 
 class NominalDynamics(ParametricMap, RobotMap):
-    r"""Features from an approximate model of the robot, such as a URDF with inaccurate masses and no friction.
+    r"""Features from an approximate model of the robot, such as a URDF with inaccurate masses.
 
-    The model's equation of motion is
+    The equation of motion of the model is
 
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + D \dot q + g(q) = B u
 
-    with its viscous damping D and the inputs on the driven joints. Each term has one column per joint. Join them to
-    `InertiaForce`, as in the example: with an exact model, the prior mean then predicts Euler's rule
-    :math:`\dot q' = \dot q + \Delta t\,\ddot q`.
+    with its viscous damping D and the inputs u on the driven joints. Join the features to `InertiaForce`, as in the
+    example. See the user guide, :doc:`/guide/priors`.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        The approximate model, as in `skevgp.datasets.load_robot`. If None, X passes through and the weights get the
-        regressor's wide default prior.
+        Approximate model, as in `skevgp.datasets.load_robot`. If None, X passes through, and the weights get the wide
+        default prior of the regressor.
     terms : sequence of str, default=("acceleration",)
-        Groups of columns, in the given order:
+        Groups of columns, with one column for each joint:
 
-        - ``"acceleration"``: :math:`\ddot q`, rad/s² or m/s²;
-        - ``"gravity"``: :math:`g(q)`, N m or N;
-        - ``"bias"``: :math:`C \dot q + g`, N m or N;
-        - ``"input"``: :math:`M^{-1} B u`, the acceleration by the input.
+        - ``"acceleration"``: :math:`\ddot q`, rad/s² or m/s²
+        - ``"gravity"``: :math:`g(q)`, N m or N
+        - ``"bias"``: :math:`C \dot q + g`, N m or N
+        - ``"input"``: :math:`M^{-1} B u`, the acceleration by the input
     dt : float or "column", default=0.03
-        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights are
-        rates (see Notes).
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights
+        are rates.
     outputs : sequence of int or str, default=None
-        States in the columns of y, by index or name. If None, all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all states [q, q̇].
     model_error : float, default=0.3
-        Relative error of the model's accelerations. The weight of a joint's acceleration for its velocity is Δt times 1
-        ± ``model_error``.
+        Relative error of the accelerations of the model.
     unknown_ratio : float, default=1.0
-        Prior standard deviation of what the torques ``"gravity"`` and ``"bias"`` contribute to velocities, as a
-        multiple of the change that the prior mean of all features leaves.
+        Prior standard deviation of the contribution of ``"gravity"`` and ``"bias"`` to velocities, in units of the
+        residual of the prior mean.
     other_ratio : float, default=0.03
-        The same for all other weights, whose mean is 0. With 0 they stay 0.
+        Prior standard deviation of the contribution of all other features, in units of the same residual.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
         Priors of unknown factors on numbers of the model, such as ``{"mass(elbow)": LogNormal(1.0, 0.2)}``. The
-        regressor learns the factors. With a factor of 1 a number is that of the model. If None, the model is used as it
-        is. For each joint there are these factors, as far as the model's number is not 0:
+        regressor learns the factors. If None, the model is used as it is. A joint moves a link, which has these
+        factors:
 
-        - ``"mass(joint)"``: mass and rotational inertia of the link that the joint moves, which keeps its shape;
-        - ``"length(joint)"``: size of this link. It multiplies the distances from the joint to the link's centre of
-          mass and to the next joints, and its square multiplies the rotational inertia. The mass stays the same;
-        - ``"inertia(joint)"``: rotational inertia of this link about its centre of mass;
-        - ``"damping(joint)"``: viscous damping of the joint;
-        - ``"armature(joint)"``: reflected inertia of the rotor.
-
-        All bodies that are fixed to each other are one link. In the first three names, the name of any of them may
-        stand for the joint. Frames of bodies that do not move have no parameters.
+        - ``"mass(joint)"``: mass and rotational inertia of the link
+        - ``"length(joint)"``: size of the link, which does not change its mass
+        - ``"inertia(joint)"``: rotational inertia of the link about its centre of mass
+        - ``"damping(joint)"``: viscous damping of the joint
+        - ``"armature(joint)"``: reflected inertia of the rotor
 
     Attributes
     ----------
     theta_ : dict of str to float
-        Factors that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
-        ``feature_map_`` of a fitted regressor, they are those of the posterior.
+        Factors that ``transform`` uses. `fit` sets the prior medians, and a regressor sets the posterior medians in its
+        ``feature_map_``.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
@@ -94,17 +89,8 @@ class NominalDynamics(ParametricMap, RobotMap):
 
     Notes
     -----
-    Masses with an error of 20 % change accelerations by about as much; the default of ``model_error`` is somewhat
-    wider. The prior standard deviations for a position are Δt times those for its velocity.
-
-    If ``terms`` has ``"acceleration"``, the weights of ``"input"`` are corrections with mean 0. Otherwise their mean is
-    Δt.
-
-    With ``dt="column"`` the features are multiplied by the Δt of their row, and the weight of a joint's acceleration
-    has mean 1 and standard deviation ``model_error``.
-
-    Effort limits are not applied, and dry friction is left out. Do not scale the columns of X before this map. Scale in
-    the ``kernel_map`` of the regressor, which only the kernel uses.
+    The weights of ``"input"`` have mean 0 if ``terms`` has ``"acceleration"``, and otherwise Δt. Do not scale the
+    columns of X before this map. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
 
     Examples
     --------
@@ -120,15 +106,6 @@ class NominalDynamics(ParametricMap, RobotMap):
            [0.03, 0.  ]])
     >>> make_union(InertiaForce("pendulum"), nominal).fit_transform([[0.1, 0.0, 1.0]]).shape
     (1, 5)
-
-    With the time step of each row as its last column:
-
-    >>> logged = NominalDynamics("pendulum", dt="column")
-    >>> logged.fit_transform([[0.1, 0.0, 1.0, 0.01], [0.1, 0.0, 1.0, 0.02]]).round(4)
-    array([[0.0204],
-           [0.0408]])
-    >>> logged.get_feature_names_out().tolist()
-    ['dt * acc(q)']
 
     A cartpole whose pole has an unknown length:
 

@@ -40,41 +40,39 @@ class _Symbol(np.ndarray):
 
 
 class ParametricFeatures(TransformerMixin, StatefulEstimator):
-    r"""Features h(x; θ) from a function, with parameters θ that a regressor learns.
+    """Features h(x; θ) from a function, with parameters θ that a regressor learns.
 
-    Use it as the ``feature_map`` of `EVGPRegressor` or `EGPRegressor`, for physics that is not linear in all that is
-    unknown: a length, a Stribeck velocity, a time constant, or the input of a simulator. The regressor finds θ together
-    with the weights β, kernel and noise, and its ``theta_`` and ``theta_std_`` are mean and standard deviation of the
-    posterior. See :doc:`/guide/parameters`.
+    Use it as the ``feature_map`` of `EVGPRegressor` or `EGPRegressor` for physics that is not linear in an unknown
+    number. Examples are a length, a Stribeck velocity, a time constant, or the input of a simulator. The regressor
+    learns θ together with the weights β, kernel and noise. Its ``theta_`` and ``theta_std_`` are medians and standard
+    deviations of the posterior. See :doc:`/guide/parameters`.
 
     Parameters
     ----------
     function : callable
-        Function in autograd.numpy: ``function(X, **theta)`` -> features of shape (n_samples,), (n_samples, n_h) or, for
-        a row for each output, (n_samples, n_outputs, n_h). X is an array. Each row of the result must depend on its own
-        row of X only.
+        Function in autograd.numpy: ``function(X, **theta)`` -> features of shape (n_samples,), (n_samples, n_h) or
+        (n_samples, n_outputs, n_h). X is an array. Each row of the result must depend on its own row of X only.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`
         Prior of each parameter, in the parameter's own units. All arguments of ``function`` without a default need one.
     units : dict of str to str, default=None
         Units of the parameters for `summary`, such as ``{"length": "m"}``.
     derivatives : {"autograd", "differences"}, default="autograd"
-        How derivatives in θ and x are found. Use ``"differences"`` if autograd cannot trace ``function``, such as a
+        Method for derivatives in θ and x. Use ``"differences"`` if autograd cannot trace ``function``, such as a
         simulator in C. It needs four more calls per parameter.
 
     Attributes
     ----------
     theta_ : dict of str to float
-        Values of the parameters that ``transform`` uses. `fit` sets the prior medians. In the ``feature_map_`` of a
-        fitted regressor, they are those of the posterior.
+        Values that ``transform`` uses. `fit` sets the prior medians, and a regressor sets the posterior medians in its
+        ``feature_map_``.
     n_features_in_ : int
         Number of columns of X.
 
     Raises
     ------
     ValueError, TypeError
-        By `fit`: if a parameter has no prior or is unknown to ``function``, or if ``function`` returns another shape or
-        numbers that are not finite for another θ, up to three prior standard deviations, or if its derivatives are not
-        finite at the prior medians.
+        `fit` raises an error if a parameter has no prior, or is unknown to ``function``. It also raises one if
+        ``function`` returns numbers that are not finite, or changes its shape, within three prior standard deviations.
 
     See Also
     --------
@@ -125,7 +123,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         X : array-like of shape (n_samples, n_features)
             Rows.
         y : Ignored
-            Not used.
+            It is not used.
 
         Returns
         -------
@@ -149,7 +147,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         Returns
         -------
         features : ndarray of shape (n_samples, n_h) or (n_samples, n_outputs, n_h)
-            h(x; θ).
+            Features h(x; θ).
         """
         check_is_fitted(self)
         return self._values(validate_data(self, X, dtype=np.float64, reset=False))
@@ -160,7 +158,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         Parameters
         ----------
         input_features : array-like of str or None, default=None
-            Names of the columns of X. They are only compared with those that `fit` has seen.
+            Names of the columns of X. They must be those of `fit`.
 
         Returns
         -------
@@ -205,7 +203,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         Returns
         -------
         jacobian : ndarray of shape (n_samples, n_h, n_theta) or (n_samples, n_outputs, n_h, n_theta)
-            ∂h/∂θ, in the order of ``parameters``.
+            Derivatives ∂h/∂θ, in the order of ``parameters``.
         """
         # Values of the parameters at which it is not finite are no optimum.
         with np.errstate(all="ignore"):
@@ -229,7 +227,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         Returns
         -------
         jacobian : ndarray of shape (n_samples, n_h, n_features) or (n_samples, n_outputs, n_h, n_features)
-            ∂h/∂x.
+            Derivatives ∂h/∂x.
         """
         check_is_fitted(self)
         return self._slopes(validate_data(self, X, dtype=np.float64, reset=False))

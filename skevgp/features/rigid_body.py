@@ -28,27 +28,26 @@ _STEP = 1e-3
 
 
 class RigidBodyRegressor(ParametricMap):
-    r"""Features of inverse dynamics: the torques of all joints are linear in one set of weights.
+    r"""Features of inverse dynamics, with one set of weights for the torques of all joints.
 
-    A robot's equation of motion with friction is
+    The equation of motion of a robot with friction is
 
-    .. math:: \tau = Y(q, \dot q, \ddot q)\,\pi + F(\dot q, \ddot q)\,\varphi
+    .. math:: \tau = Y(q, \dot q, \ddot q)\,\pi + F(\dot q, \ddot q)\,\varphi.
 
-    Here π holds ten inertial parameters of each link (mass m, first moments m c, moments of inertia about the joint's
-    frame), and φ the friction of each joint: viscous friction, Coulomb friction, an offset, and the reflected inertia
-    of its rotor ("armature"). The map returns the matrix [Y F] of each row, with one row per joint. `EVGPRegressor`
-    then fits one β = (π, φ) for all joints. The prior mean is the model of the robot, such as a URDF with inaccurate
-    masses. Parameters that torques do not depend on, such as the mass of a fixed base, keep their prior.
+    Here π holds ten inertial parameters of each link: mass, first moments, and moments of inertia about the joint's
+    frame. φ holds the friction of each joint and the reflected inertia of its rotor ("armature"). `EVGPRegressor` fits
+    one β = (π, φ) for all joints. The prior mean is the model of the robot, such as a URDF with inaccurate masses. See
+    the user guide, :doc:`/guide/torques`.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        Robot as in `skevgp.datasets.load_robot`. If None, X passes through and outputs have their own weights.
+        Robot, as in `skevgp.datasets.load_robot`. If None, X passes through, and outputs have their own weights.
     friction : sequence of str, default=("viscous", "coulomb", "offset", "armature")
-        Torques of each joint that are not those of its links: a weight times :math:`\dot q`,
-        :math:`\tanh(\dot q / v_s)`, 1 and :math:`\ddot q`.
+        Torques of each joint apart from those of its links: a weight times :math:`\dot q`, :math:`\tanh(\dot q / v_s)`,
+        1 and :math:`\ddot q`.
     stiction_velocity : float or array-like of shape (n_joints,), default=0.01
-        v_s in rad/s or m/s, for all joints or for each. Coulomb friction changes its sign smoothly within it. Above 0.
+        Velocity v_s in rad/s or m/s, above 0. Coulomb friction changes its sign smoothly within it.
     mass_scale : float, default=0.2
         Prior standard deviation of the mass of each link, as a share of the mass.
     com_scale : float, default=0.2
@@ -56,26 +55,24 @@ class RigidBodyRegressor(ParametricMap):
     inertia_scale : float, default=0.3
         Prior standard deviation of the moments of inertia, as a share of mass times squared size.
     friction_scale : float, default=0.3
-        Prior standard deviation of Coulomb friction and offset, as a share of the largest torque of the motor. It is
-        also that of viscous friction at 1 rad/s and of the rotor's torque at 10 rad/s².
+        Prior standard deviation of the torques of friction, as a share of the largest torque of the motor.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
-        Priors of unknown velocities v_s, instead of ``stiction_velocity``. Names are ``"stiction_velocity"`` for one of
-        all joints, or the joint's in brackets, such as ``{"stiction_velocity(elbow)": LogNormal(0.01, 1.0)}``. The
-        regressor learns their values. If None, they are as in ``stiction_velocity``. `skevgp.InverseDynamics` finds
-        them without parameters.
+        Priors of unknown velocities v_s, such as ``{"stiction_velocity": LogNormal(0.01, 1.0)}``. The regressor learns
+        their values. If None, ``stiction_velocity`` is used.
 
     Attributes
     ----------
     theta_ : dict of str to float
-        Velocities that ``transform`` uses, if there are ``parameters``. `fit` sets the prior medians. In the
-        ``feature_map_`` of a fitted regressor, they are those of the posterior.
+        Velocities that ``transform`` uses. `fit` sets the prior medians, and a regressor sets the posterior medians in
+        its ``feature_map_``.
     share_coef : bool
-        Whether all outputs have the same weights. True if there is a robot.
+        Whether all outputs have the same weights. It is True if there is a robot.
     model_ : pinocchio.Model
         The robot, if there is one.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it has any.
 
     See Also
     --------
@@ -84,23 +81,19 @@ class RigidBodyRegressor(ParametricMap):
 
     Notes
     -----
-    A link's size is the largest of three lengths: from its joint to the next joint, from its joint to its centre of
-    mass, and the radius of gyration about the centre of mass. The prior is a covariance (`coef_prior`), because an
-    error of the mass changes first moments and inertias too. If the model has no effort limits, the largest torque of a
-    motor is the weight of all links times the sum of their sizes.
+    The size of a link is the largest of three lengths: its radius of gyration, and the distances from its joint to the
+    next joint and to its centre of mass.
 
-    X has the columns [q, q̇, q̈]. `skevgp.datasets.load_log` computes accelerations from a robot's log. Do not scale the
-    columns of X before this map.
+    X has the columns [q, q̇, q̈], such as those of `skevgp.datasets.load_log`. Do not scale them before this map.
 
     References
     ----------
     - C. G. Atkeson, C. H. An, J. M. Hollerbach (1986): Estimation of Inertial Parameters of Manipulator Loads and
-      Links. The regressor Y is Pinocchio's ``computeJointTorqueRegressor``.
+      Links.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from skevgp.datasets import load_robot
     >>> from skevgp.features import RigidBodyRegressor
     >>> body = RigidBodyRegressor("pendulum", friction=["viscous"])
     >>> H = body.fit_transform([[0.5, 1.0, 2.0]])  # q, q̇, q̈
@@ -111,13 +104,6 @@ class RigidBodyRegressor(ParametricMap):
     array([[2.9516]])
     >>> body.get_feature_names_out()[[0, -1]].tolist()
     ['m(q)', 'viscous(q)']
-
-    Learn the velocity within which Coulomb friction changes its sign:
-
-    >>> from skevgp.features import LogNormal
-    >>> body = RigidBodyRegressor("pendulum", parameters={"stiction_velocity": LogNormal(0.01, 1.0)})
-    >>> body.fit([[0.5, 1.0, 2.0]]).theta_
-    {'stiction_velocity': 0.01}
     """
 
     def __init__(
@@ -269,14 +255,14 @@ class RigidBodyRegressor(ParametricMap):
         Parameters
         ----------
         n_outputs : int
-            Number of predicted torques: one per joint.
+            Number of predicted torques, one for each joint.
 
         Returns
         -------
         mean : ndarray of shape (n_features_out,)
             Parameters of the robot's model: links, armatures, damping and dry friction. Offsets are 0.
         covariance : ndarray of shape (n_features_out, n_features_out)
-            Covariance, with independent links, to first order in the errors of mass, centre of mass and shape.
+            Covariance to first order in the errors of mass, centre of mass and shape. Links are independent.
 
         Raises
         ------
@@ -317,7 +303,7 @@ class RigidBodyRegressor(ParametricMap):
         Parameters
         ----------
         n_outputs : int
-            Number of predicted torques: one per joint.
+            Number of predicted torques, one for each joint.
 
         Returns
         -------

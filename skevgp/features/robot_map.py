@@ -67,23 +67,23 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``. For `RigidBodyRegressor`, rows [q, q̇, q̈]. Without a
-            robot, any columns.
+            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``. `RigidBodyRegressor` takes rows [q, q̇, q̈].
+            Without a robot, X may have any columns.
         y : None
             Ignored.
 
         Returns
         -------
         self : RobotTransformer
-            Fitted.
+            The transformer itself, fitted.
 
         Raises
         ------
         ImportError
-            If the robot needs Pinocchio and it is not installed.
+            If the robot needs Pinocchio, which is not installed.
         ValueError, TypeError
-            If the robot is unknown, X has other columns than the robot, a time step is not positive, or X is a data
-            frame with the robot's joints in another order.
+            If the robot is unknown, X has other columns than the robot, or a time step is not positive. If X is a data
+            frame with the joints in another order.
 
         Warns
         -----
@@ -172,14 +172,15 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Returns
         -------
         J : ndarray of the shape of H, and (n_features,)
-            The derivatives dh(x)/dx of each row. They are analytic, except for `RigidBodyRegressor`, whose derivatives
-            of Y are central differences of fourth order.
+            Derivatives dh(x)/dx of each row. They are analytic, except for `RigidBodyRegressor`, whose derivatives of Y
+            are central differences of fourth order.
 
         Notes
         -----
         `LinkGravity` uses ∂(Rᵢᵀ g)/∂q_j = Rᵢᵀ (g × a_j) for each revolute joint j with axis a_j between the base and
-        link i. `NominalDynamics` uses the derivatives of Pinocchio (Carpentier & Mansard, "Analytical derivatives of
-        rigid body dynamics algorithms", RSS 2018).
+        link i.
+
+        `NominalDynamics` uses the analytical derivatives of Pinocchio (Carpentier & Mansard, RSS 2018).
         """
         return self._slopes(self._checked(X))
 
@@ -198,12 +199,12 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Parameters
         ----------
         input_features : array-like of str, default=None
-            Names of the columns of X. If None, those seen in `fit`, or those of the robot.
+            Names of the columns of X. If None, those of `fit`, or those of the robot.
 
         Returns
         -------
         names : ndarray of str of shape (n_features_out,)
-            One per column of what `transform` returns.
+            Name of each column of the result of `transform`.
         """
         check_is_fitted(self)
         if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
@@ -281,7 +282,7 @@ class ParametricMap(RobotTransformer):
         Returns
         -------
         priors : dict of str to prior
-            The argument ``parameters``. Empty if the map has no parameters.
+            The argument ``parameters``. It is empty if the map has no parameters.
         """
         return dict(self.parameters or {})
 
@@ -307,7 +308,7 @@ class ParametricMap(RobotTransformer):
         Returns
         -------
         jacobian : ndarray of the shape of the features, and (n_theta,)
-            ∂h/∂θ, in the order of ``parameters``.
+            Derivatives ∂h/∂θ, in the order of ``parameters``.
         """
         X = np.asarray(X, dtype=np.float64)
         if not self._timed:
@@ -354,7 +355,7 @@ class ParametricMap(RobotTransformer):
                 )
             for other, (its_kind, its_joints) in targets.items():
                 if kind == its_kind and set(joints) & set(its_joints):
-                    raise ValueError(f"The parameters {other!r} and {name!r} are for the same joint: leave one out.")
+                    raise ValueError(f"Parameters {other!r} and {name!r} are for the same joint. Remove one of them.")
             targets[name] = kind, joints
         return targets
 
@@ -455,17 +456,17 @@ class RobotMap(RobotTransformer):
 
     @available_if(has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior of the weights β, as far as it does not depend on the data.
+        """Return the part of the prior of the weights β that does not depend on the data.
 
         Parameters
         ----------
         n_outputs : int
-            Number of predicted states: 2 * n_joints, or the length of ``outputs``.
+            Number of predicted states, 2 * n_joints or the length of ``outputs``.
 
         Returns
         -------
         mean, scale : ndarray of shape (n_outputs, n_features_out)
-            Means and standard deviations. Standard deviations in units of the data are NaN (see `coef_scale`).
+            Means and standard deviations. A standard deviation that depends on the data is NaN (see `coef_scale`).
 
         Raises
         ------
@@ -489,20 +490,20 @@ class RobotMap(RobotTransformer):
 
     @available_if(has_robot)
     def coef_scale(self, left_over: ArrayLike, size: ArrayLike) -> np.ndarray:
-        """Return standard deviations of the prior in units of the data.
+        """Return the prior standard deviations that depend on the data.
 
         Parameters
         ----------
         left_over : array-like of shape (n_outputs,)
-            Root mean square of what the prior mean leaves of each column of y: rms(y - h(x)ᵀμ).
+            Root mean square of the residual of the prior mean, rms(y - h(x)ᵀμ), for each column of y.
         size : array-like of shape (n_features_out,)
-            Root mean square of each feature. Above 0.
+            Root mean square of each feature, above 0.
 
         Returns
         -------
         scale : ndarray of shape (n_outputs, n_features_out)
-            A ratio of the map times ``left_over / size``. For a position, ``left_over`` is Δt times that of its
-            velocity, if y has the velocity. NaN for weights with a standard deviation of their own (see `coef_prior`).
+            Ratio of the map times ``left_over / size``. For a position, ``left_over`` is Δt times that of its velocity,
+            if y has the velocity. It is NaN if `coef_prior` gives the standard deviation.
         """
         layout = self._known_layout()
         left_over = np.asarray(left_over, dtype=float)
@@ -533,8 +534,8 @@ class RobotMap(RobotTransformer):
         Returns
         -------
         labels : ndarray of str of shape (n_outputs, n_features_out)
-            The group of each weight. The weights for a position have the groups of those for its velocity, or "known"
-            if Newton's law gives them.
+            Group of each weight. The weights for a position have the groups of those for its velocity, or "known" if
+            Newton's law gives them.
         """
         layout = self._known_layout()
         rows = self._checked_states(layout, n_outputs)
@@ -556,7 +557,7 @@ class RobotMap(RobotTransformer):
             names = [layout.state_names[row] for row in rows]
             raise ValueError(
                 f"y has {n_outputs} columns, but {type(self).__name__} of the robot {layout.name!r} predicts "
-                f"{len(rows)} states: {names}. Say which ones y holds with outputs=[...]; the names are "
+                f"{len(rows)} states: {names}. Name the columns of y by outputs=[...]. The names are "
                 f"{layout.state_names}."
             )
         return rows

@@ -32,7 +32,7 @@ class Prior(ABC):
         Parameters
         ----------
         z : float
-            Coordinate: 0 at the median, ±1 at one standard deviation of a normal variable.
+            Coordinate, which is 0 at the median and ±1 at one standard deviation of a normal variable.
 
         Returns
         -------
@@ -130,7 +130,7 @@ class LogNormal(Prior):
     median : float
         Median, in units of the parameter, above 0.
     sigma : float
-        Standard deviation of the logarithm, above 0: about the relative uncertainty if it is small.
+        Standard deviation of the logarithm, above 0. A small value is about the relative uncertainty.
 
     Raises
     ------

@@ -20,9 +20,9 @@ _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
 DEPENDENT_ROWS = (
-    "Rows near each other are alike: left out in blocks, they are predicted worse than at random, and std is too "
-    "small for new trajectories. Say in fit(X, y, groups=...) which rows belong together, such as the number of each "
-    "row's trajectory. (Where rows are sorted but independent, shuffle them, or ignore this warning.)"
+    "Neighbouring rows are similar, and blocks of rows are predicted worse than single rows. std is too small for new "
+    "trajectories. Pass groups to fit(X, y, groups=...) to identify the trajectory of each row. If rows are sorted but "
+    "independent, shuffle them, or ignore this warning."
 )
 
 
@@ -37,14 +37,14 @@ def ended_early(
         return ""
     if n_iter < max_iter:
         return (
-            f"{solver} stopped after {n_iter} iterations: rounding errors keep hiding the way up, as in data without "
-            f"noise. The best parameters are kept; a larger tol{', fewer inducing points' if sparse else ''} or a "
-            "WhiteKernel with a lower bound on the noise end sooner."
+            f"{solver} stopped after {n_iter} iterations, because rounding errors hide further progress. This is usual "
+            f"for data without noise. The best parameters are kept. Use a larger tol"
+            f"{', fewer inducing points' if sparse else ''}, or a WhiteKernel with a lower bound on the noise."
         )
     sooner = 'a number for tol (now "auto")' if tol is None else f"a larger tol (now {tol})"
     return (
         f"The {'bound' if sparse else 'likelihood'} was still rising after max_iter={max_iter} iterations. Raise "
-        f"max_iter, or stop earlier on purpose with {sooner}."
+        f"max_iter, or stop earlier with {sooner}."
     )
 
 
@@ -52,22 +52,21 @@ def mini_batches_ended(solver: str, minimum: Minimum, fell: bool, learning_rate:
     """Why a solver on mini-batches failed. ``fell`` says whether its bound ended below the first one."""
     if not minimum.converged:
         return (
-            f"{solver} diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
+            f"{solver} diverged after {minimum.n_iter} steps. The best parameters so far are kept. Lower learning_rate "
             f"(now {learning_rate}), or raise batch_size (now {batch_size})."
         )
     if fell:
         return (
-            f"{solver} ended with a bound below the first after all its {minimum.n_iter} steps; the best parameters "
-            "are kept. Raise max_iter (steps become small only towards the end) or batch_size, or lower "
-            f"learning_rate (now {learning_rate})."
+            f"{solver} ended with a bound below the first one after {minimum.n_iter} steps. The best parameters are "
+            f"kept. Raise max_iter or batch_size (now {batch_size}), or lower learning_rate (now {learning_rate})."
         )
     return ""
 
 
 def interrupted(n_iter: int, max_time: float | None = None) -> str:
     """Message that Ctrl-C, or the end of ``max_time``, ended the fit."""
-    how = "was interrupted" if max_time is None else f"ended since max_time={max_time:g} seconds were over,"
-    return f"The fit {how} after {n_iter} iterations; the best parameters so far are kept."
+    how = "was interrupted" if max_time is None else f"ended at max_time={max_time:g} seconds"
+    return f"The fit {how} after {n_iter} iterations. The best parameters so far are kept."
 
 
 def signal_gone(gone: int, n_outputs: int) -> str:
@@ -75,9 +74,9 @@ def signal_gone(gone: int, n_outputs: int) -> str:
     if not gone:
         return ""
     return (
-        f"What the Gaussian process learned of {gone} of {n_outputs} outputs fitted together does not hold for groups "
-        "that were left out: these are predicted no better than without it, and std says so. More groups, other "
-        "columns (kernel_map) or features may tell what groups have in common."
+        f"The Gaussian process does not improve predictions of left-out groups for {gone} of {n_outputs} outputs that "
+        "are fitted together. std accounts for this. More groups, other columns (kernel_map) or "
+        "other features may help."
     )
 
 
@@ -87,15 +86,15 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
     far = rows.residuals.mean[rows.columns] ** 2
     if (rows.scatter() / rows.mean_precision < _FAR**-2 * np.minimum(far, 1.0)).any():
         return (
-            f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
-            "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."
+            f"y is more than {_FAR:g} times its scatter away from its prior mean of 0, which leaves the kernel little "
+            "accuracy for the rest. Set normalize_y=True, or add an intercept to the feature_map."
         )
     # Weights with a learned scale are as far as their scale allows.
     fixed = True if prior.groups is None else prior.groups < 0
     if ((np.abs(prior.reference) > _FAR_WEIGHT) & fixed).any():
         return (
-            f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
-            "raise the scale of coef_prior or, if it is an intercept's, set normalize_y=True."
+            f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean. "
+            "Raise the scale of coef_prior. For an intercept, set normalize_y=True."
         )
     return ""
 
@@ -120,16 +119,16 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
         return ""
     cause = ""
     if len(noise) > nothing.sum():
-        cause = "If they share its kernel's shape with outputs of which it learned, that may be why: " + (
-            'sharing="none" gives each its own. Or raise '
+        cause = "They may share the kernel's shape with outputs that need another one. " + (
+            'Use sharing="none" for independent kernels, or raise '
             if sparse
-            else "MultiOutputRegressor(EGPRegressor(...)) fits each by itself. Or raise "
+            else "Use MultiOutputRegressor(EGPRegressor(...)) for independent kernels, or raise "
         )
     return (
-        f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
-        "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
-        f"{cause or 'Raise '}{'n_inducing, or n_restarts of the solver' if sparse else 'n_restarts'}, let kernel or "
-        "noise start elsewhere, or look at the scales of the kernel's columns."
+        f"The noise explains the whole residual of the features for {nothing.sum()} of {len(nothing)} outputs that are "
+        "fitted together. The Gaussian process learned nothing from any start, although neighbouring rows are similar. "
+        f"{cause or 'Raise '}{'n_inducing, or n_restarts of the solver' if sparse else 'n_restarts'}, start kernel or "
+        "noise elsewhere, or check the scales of the kernel's columns."
     )
 
 
@@ -145,7 +144,7 @@ def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str
     if correlated.mean() > _WHITE_SHARE or not alike_neighbours(rows).any():
         return ""
     return (
-        "The kernel became white noise: to it neighbouring rows are strangers, though they are alike, and elsewhere it "
-        "predicts nothing beyond the features and the prior mean. Let its length scales start higher, raise their "
+        "The kernel became white noise, although neighbouring rows are similar. Away from the training rows, "
+        "predictions are those of the features and the prior mean alone. Start the length scales higher, raise their "
         "lower bounds, or raise n_restarts (of the solver, if there is one)."
     )

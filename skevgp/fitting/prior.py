@@ -24,29 +24,30 @@ _ROUNDING = 1e-8
 
 
 class CoefPrior(StatefulEstimator):
-    """Prior of the weights β of the explicit features, β ~ N(mean, Σ), for ``coef_prior=`` of the regressors.
+    """Prior β ~ N(mean, Σ) of the weights of the explicit features.
+
+    Pass it to a regressor as ``coef_prior``. See the user guide, :doc:`/guide/priors`.
 
     Parameters
     ----------
     mean : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
-        Prior mean. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``; for a map without one, it is 0.
+        Prior mean. If ``"auto"``, that of the method ``coef_prior(n_outputs)`` of the feature map, or 0 if the map has
+        no such method.
     scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
-        Prior standard deviation. ``"auto"`` asks the feature map; for a map without an opinion it is
-        10 * std(y) / rms(h). A scale of 0 keeps a weight at its mean. `EGPRegressor` takes ``np.inf``: its estimate of
-        such a weight is that of generalised least squares (Rasmussen & Williams 2006, eq. 2.42 to 2.45).
+        Prior standard deviation. If ``"auto"``, that of the feature map, or 10 * std(y) / rms(h) if the map has no
+        prior. A scale of 0 keeps a weight at its mean. `EGPRegressor` also takes ``np.inf``, which gives generalised
+        least squares.
     cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
-        Prior covariance Σ, of all outputs or of each, instead of ``scale``. The mass and the first moment of a link,
-        for example, are correlated in any honest prior.
+        Prior covariance Σ, of all outputs or of each, instead of ``scale``. For example, the mass and the first moment
+        of a link are correlated.
     shared : bool or "auto", default="auto"
-        Whether all outputs have the same weights, as the torques of a robot's joints have one set of inertial
-        parameters. Then ``mean``, ``scale`` and ``coef_`` have no axis of outputs, all outputs are fitted together, and
-        they depend on each other (``predict(X, return_cov="joint")``). ``"auto"`` asks the feature map's attribute
-        ``share_coef``. Not for Adam or the diagonal posterior.
+        Whether all outputs have the same weights, like the torques of a robot with one set of inertial parameters. Then
+        ``mean``, ``scale`` and ``coef_`` have no axis of outputs. If ``"auto"``, the attribute ``share_coef`` of the
+        feature map decides.
     groups : array-like of str of shape (n_h,) or (n_outputs, n_h), "auto" or None, default="auto"
-        Labels of the weights. Weights of one output with the same label are a group. The fit learns a factor for the
-        standard deviations of each group, together with kernel and noise. The logarithm of the factor has the prior
-        N(0, 1). A weight with an empty label keeps its standard deviation. ``"auto"`` asks the feature map, unless
-        ``scale`` or ``cov`` are given. If None, all standard deviations stay.
+        Labels of the weights. The fit learns a factor on the standard deviations of all weights with the same label,
+        for each output. An empty label keeps the standard deviation. If ``"auto"``, the labels are those of the feature
+        map, unless ``scale`` or ``cov`` are given. If None, all standard deviations stay.
 
     Examples
     --------
@@ -58,6 +59,21 @@ class CoefPrior(StatefulEstimator):
     >>> model = EVGPRegressor(PolynomialFeatures(1), coef_prior=prior, n_inducing=10, random_state=0).fit(X, y)
     >>> model.coef_prior_scale_
     array([5., 5.])
+
+    The torques of gravity in two joints are linear in the same two first moments, 20 and 5. Each joint has a row of
+    features:
+
+    >>> import numpy as np
+    >>> from sklearn.preprocessing import FunctionTransformer
+    >>> def gravity(X):
+    ...     own, both = np.sin(X[:, 0]), np.sin(X[:, 0] + X[:, 1])
+    ...     return np.stack([np.column_stack([own, both]), np.column_stack([0.0 * own, both])], axis=1)
+    >>> X = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
+    >>> y = gravity(X) @ [20.0, 5.0] + np.cos(2.0 * X)
+    >>> prior = CoefPrior(shared=True)
+    >>> model = EVGPRegressor(FunctionTransformer(gravity), coef_prior=prior, n_inducing=20, random_state=0).fit(X, y)
+    >>> model.coef_.round(1)
+    array([20.,  5.])
     """
 
     def __init__(
@@ -139,10 +155,10 @@ def resolved(
     for name in ("mean", "scale", "cov", "groups"):
         value = getattr(prior, name)
         if feature_map is None and (isinstance(value, list | tuple) or np.ndim(value) > 0):
-            raise ValueError(f"{name} of CoefPrior needs a feature_map: without one there are no weights.")
+            raise ValueError(f"{name} of CoefPrior needs a feature_map, because its features have the weights.")
     if prior.cov is not None and _word(prior.scale) != "auto":
         raise ValueError(
-            f"cov and scale={prior.scale!r} of CoefPrior both say how far weights may be; give one of them."
+            f"cov and scale={prior.scale!r} of CoefPrior both set the prior covariance. Pass one of them only."
         )
     by_hand = _word(prior.scale) != "auto" or prior.cov is not None
     parts: list[_Part] = []
@@ -222,7 +238,7 @@ def _groups(
         groups[...] = labels
         groups[np.array([[label is None for label in row] for row in groups], dtype=bool)] = ""
         if not all(isinstance(label, str) for label in groups.ravel()):
-            raise ValueError(f"groups of CoefPrior must be words, or None for none; got {prior.groups!r}.")
+            raise ValueError(f"groups of CoefPrior must be strings or None; got {prior.groups!r}.")
         return groups
     labelled = [part for part in parts if hasattr(part.feature_map, "coef_groups")]
     for part in [] if by_hand else labelled:
@@ -246,7 +262,7 @@ def root_of_correlation(correlation: np.ndarray, groups: np.ndarray) -> np.ndarr
         if correlation[own][:, groups != group].any():
             raise ValueError(
                 f"Weights of different groups must be independent; those of the group {group!r} are correlated with "
-                "others. CoefPrior(groups=None) leaves all scales as they are."
+                "others. CoefPrior(groups=None) keeps all scales."
             )
         eigenvalues, vectors = eigh(correlation[np.ix_(own, own)])
         root[np.ix_(own, own)] = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))

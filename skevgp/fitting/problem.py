@@ -110,7 +110,7 @@ class Problem:
             if spec.starts.noise.value is not None:
                 raise ValueError(
                     f"The noise starts either from variance={noise.variance!r} of {type(noise).__name__} or from the "
-                    f"WhiteKernel of kernel={kernel!r}; give one of them."
+                    f"WhiteKernel of kernel={kernel!r}. Pass one of them only."
                 )
             spec = spec.with_noise(noise.variance)
         target_mean = targets.mean if normalize_y else np.zeros(len(targets.mean))
@@ -185,7 +185,7 @@ def _prior(
     if isinstance(shared, str):
         shared = says_shared(feature_map)
     elif shared and feature_map is None:
-        raise ValueError("shared=True of CoefPrior needs a feature_map: without one there are no weights to share.")
+        raise ValueError("shared=True of CoefPrior needs a feature_map, because its features have the weights.")
     shared = bool(shared) and o > 1 and feature_map is not None
     # A bump far from all rows, for example, counts as 0.
     size = np.where(features.largest > _NEGLIGIBLE * features.largest.max(initial=0.0), features.rms, 0.0)

@@ -57,7 +57,7 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
     at = kernel.at(np.log(hyperparameters), inducing_points)
     K = at.matrix()
     if not np.isfinite(K).all():
-        raise ValueError("kernel: k(X, X) is not finite, with its hyperparameters where they start.")
+        raise ValueError("kernel: k(X, X) is not finite at the start of its hyperparameters.")
     variance = float(np.mean(np.diagonal(K)))
     if np.abs(K - K.T).max() > 1e-8 * np.abs(K).max():
         raise ValueError("kernel: k(X, X) must be symmetric.")
@@ -67,16 +67,16 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
         jittered_cholesky(K)
     except NotPositiveDefiniteError:
         raise ValueError(
-            "kernel: k(X, X) must be positive semi-definite and not 0; with its hyperparameters where they start it is "
-            "not. (ExpSineSquared is one of a single column, times others.)"
+            "kernel: k(X, X) must be positive semi-definite and not 0 at the start of its hyperparameters. "
+            "ExpSineSquared is positive semi-definite for a single column only."
         ) from None
     difference = np.abs(at.diagonal(kernel.prepare(inducing_points)) - np.diagonal(K)).max()
     if not difference <= 1e-6 * np.diagonal(K).max():
-        raise ValueError("kernel: its function for the diagonal does not return the k(x, x) of k(X, X).")
+        raise ValueError("kernel: its function for the diagonal must return the diagonal of k(X, X).")
     if not all(np.isfinite(gradient).all() for gradient in at.finish_pullback(at.start_pullback(), np.eye(len(K)))):
         raise ValueError(
-            "kernel: its gradient is not finite where x = x'. A function of the distance needs a squared distance that "
-            "is not quite 0 there: anp.sqrt(squares + 1e-12)."
+            "kernel: its gradient is not finite where x = x'. If it depends on a distance, add a small number to the "
+            "squared distance: anp.sqrt(squares + 1e-12)."
         )
     return variance
 

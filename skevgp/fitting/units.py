@@ -215,8 +215,8 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
         if rank < mask.sum():
             raise ValueError(
                 "An infinite scale of CoefPrior needs features that are linearly independent on the rows of X: "
-                f"{mask.sum()} features have an infinite scale, but only {rank} of them are independent. Give some a "
-                "finite scale."
+                f"{mask.sum()} features have an infinite scale, but only {rank} of them are independent. Pass a "
+                "finite scale for some of them."
             )
 
 

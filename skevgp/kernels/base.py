@@ -67,8 +67,8 @@ def one_lengthscale(kernel: Any, n_columns: int) -> bool:
     """Whether a kernel has one length scale for all columns; ValueError if it has neither one nor one per column."""
     if kernel.anisotropic and len(kernel.length_scale) != n_columns:
         raise ValueError(
-            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
-            "give one length scale, or one per column."
+            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns. "
+            "Pass one length scale, or one for each column."
         )
     return not kernel.anisotropic
 

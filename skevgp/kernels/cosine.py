@@ -14,29 +14,29 @@ from .waves import Waves
 
 
 class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
-    r"""An undamped wave: periodic in the scaled difference of inputs.
+    r"""Undamped wave, periodic in the scaled difference of inputs.
 
     .. math:: k(x, x') = \cos\Bigl(2 \pi \sum_d \frac{x_d - x'_d}{\ell_d}\Bigr)
 
-    Functions drawn from it are sinusoids with random phase and amplitude. It is a spectral mixture of one component
-    without width (Wilson & Adams 2013), and a covariance for any number of columns (Rasmussen & Williams 2006, eq.
-    4.5). Multiply it by an `RBF` for a damped wave.
+    Functions drawn from it are sinusoids with random phase and amplitude. The kernel is a spectral mixture of one
+    component without width (Wilson & Adams 2013). Multiply it by an `RBF` for a damped wave.
 
-    It works in `EVGPRegressor`, in scikit-learn's GaussianProcessRegressor, and in sums and products with other
+    The kernel works in `EVGPRegressor`, in scikit-learn's GaussianProcessRegressor, and in sums and products with other
     kernels.
 
     Parameters
     ----------
     length_scale : float or array-like of shape (n_features,), default=1.0
-        Period ℓ in units of the columns: one for all columns, or one per column.
+        Period ℓ in units of the columns, one for all columns or one for each.
     length_scale_bounds : pair of floats, "fixed", or array-like of shape (n_features, 2), default=(1e-5, 1e5)
         Bounds of the length scale.
 
     Attributes
     ----------
     anisotropic : bool
-        Whether there is one length scale per column.
+        Whether each column has its own length scale.
     hyperparameter_length_scale : Hyperparameter
+        Length scale and its bounds.
 
     References
     ----------

@@ -22,19 +22,19 @@ _CHUNK = 128
 
 
 class FunctionKernel(sk.Kernel):
-    """A covariance written as a function in autograd.numpy.
+    """Covariance written as a function in autograd.numpy.
 
-    It works in `EVGPRegressor`, in scikit-learn's GaussianProcessRegressor, and in sums and products with other
+    The kernel works in `EVGPRegressor`, in scikit-learn's GaussianProcessRegressor, and in sums and products with other
     kernels.
 
     Parameters
     ----------
     function : callable
         Symmetric, positive semi-definite function in autograd.numpy: ``function(X, Z, **hyperparameters)`` -> array of
-        shape (len(X), len(Z)). Its parameters with a float as default are the hyperparameters. They are positive, and
-        start at the default. Other defaults (integers, strings) are constants.
+        shape (len(X), len(Z)). Parameters with a float as default are the hyperparameters. They are positive, and start
+        at the default. Other defaults, such as integers and strings, are constants.
     values : dict of str to float, default=None
-        Start values of hyperparameters that replace the defaults.
+        Start values that replace the defaults of hyperparameters.
     values_bounds : pair of floats, "fixed", or dict of str to either, default=(1e-5, 1e5)
         Bounds of all hyperparameters, or of those named in a dict.
     diagonal : callable, default=None
@@ -49,8 +49,8 @@ class FunctionKernel(sk.Kernel):
     Raises
     ------
     ValueError
-        When the kernel is used: if a default is not positive, a name is unknown or taken, the function returns another
-        shape or numbers that are not finite, or autograd cannot trace it.
+        Using the kernel raises an error if a default is not positive, or a name is unknown or taken. It also raises one
+        if the function returns another shape or numbers that are not finite, or autograd cannot trace it.
 
     Examples
     --------
@@ -161,22 +161,22 @@ class FunctionKernel(sk.Kernel):
         Parameters
         ----------
         X : array-like of shape (n, d)
-            The rows.
+            Rows.
 
         Returns
         -------
         diagonal : ndarray of shape (n,)
-            The variances.
+            Variances.
         """
         return np.asarray(self.covariance().diagonal_values(self._log_values(), np.atleast_2d(X)), dtype=float)
 
     def is_stationary(self) -> bool:
-        """Whether the kernel depends on differences of inputs only. It is not known, so that the answer is False.
+        """Return False, because it is unknown whether the kernel depends on differences of inputs only.
 
         Returns
         -------
         stationary : bool
-            False.
+            Always False.
         """
         return False
 
@@ -281,7 +281,7 @@ class Function(Covariance):
                 return differentiate()
         except (TypeError, ValueError, AttributeError, NotImplementedError, IndexError) as error:
             raise ValueError(
-                f"{name_of(self.function)} cannot be traced by autograd: write it with autograd.numpy in place of "
+                f"{name_of(self.function)} cannot be traced by autograd. Write it with autograd.numpy instead of "
                 f"numpy. ({type(error).__name__}: {error})"
             ) from error
 

@@ -77,9 +77,9 @@ class Map:
         jacobian = as_floats(self.transformer.jacobian(as_fitted(self.transformer, X, self._package)))
         if jacobian.ndim not in (3, 4) or (len(jacobian), jacobian.shape[-1]) != X.shape:
             raise ValueError(
-                f"The method jacobian of {self.transformer!r} must return (n_samples, n_features_out, n_features) or, "
-                f"of a map with a row for each output, (n_samples, n_outputs, n_features_out, n_features); for X of "
-                f"the shape {X.shape} it returned {jacobian.shape}."
+                f"The method jacobian of {self.transformer!r} must return the shape (n_samples, n_features_out, "
+                "n_features), or (n_samples, n_outputs, n_features_out, n_features) for a map with a row for each "
+                f"output. For X of the shape {X.shape} it returned {jacobian.shape}."
             )
         return jacobian
 

@@ -326,8 +326,8 @@ def _joints_of(model: Any, factors: Mapping[str, Sequence[Any]]) -> list[_Joint]
     for name, joint in zip(names, joints, strict=True):
         if not joint.shortname().startswith(_KNOWN) or joint.nq != 1:
             raise ValueError(
-                f"The joint {name!r} of the robot {model.name!r} is of the type {joint.shortname()}; what can be "
-                "exported are revolute and prismatic joints."
+                f"The joint {name!r} of the robot {model.name!r} is of the type {joint.shortname()}. Only revolute "
+                "and prismatic joints can be exported."
             )
     found = []
     for i, (axis, armature) in enumerate(zip(joint_axes(model), model.armature.tolist(), strict=True)):

@@ -21,21 +21,21 @@ _SMALLEST = 1e-290
 
 
 class Gaussian(Noise):
-    """Gaussian noise, for ``noise=`` of the regressors.
+    """Gaussian noise, for the argument ``noise`` of a regressor.
 
     Parameters
     ----------
     variance : float, default=None
-        Noise variance at the start of a fit, in squared units of y. If None, it is taken from the data.
+        Noise variance at the start of a fit, in squared units of y. If None, it is estimated from the data.
     inputs : float or array-like of shape (n_features,) or (n_features, n_features), default=None
-        Standard deviations, or the covariance, of noise in X. The noise variance of a row is then σ² + ∂g Σ ∂gᵀ
-        (McHutchon & Rasmussen 2011); σ² and ``std`` are those of rows without noise in X. Not for Dask arrays or Adam.
-        See the user guide, :doc:`/guide/noise`.
+        Standard deviations, or the covariance Σ, of noise in X. The noise variance of a row is then σ² + ∂g Σ ∂gᵀ
+        (McHutchon & Rasmussen 2011). σ² and ``std`` are those of rows without noise in X. Dask arrays and Adam do not
+        support it. See the user guide, :doc:`/guide/noise`.
 
     Notes
     -----
-    With ``inputs``, the variance of a row is averaged over outputs that are fitted together, and fits are repeated
-    until σ² changes by less than 5 %, at most five times.
+    With ``inputs``, the variance of a row is averaged over outputs that are fitted together. Fits are repeated until σ²
+    changes by less than 5 %, at most five times.
 
     Examples
     --------

@@ -36,20 +36,20 @@ _NU, _WIDTH, _SHARE = 4.0, 30.0, 1e-6
 
 
 class StudentT(Noise):
-    """Noise with outliers, for ``noise=`` of `EVGPRegressor`.
+    """Noise with outliers, for the argument ``noise`` of `EVGPRegressor`.
 
     Rows with an error of more than about six standard deviations are outliers. Their noise is a Student-t with 4
     degrees of freedom, thirty times as wide. The noise of all other rows is Gaussian. The attribute ``weights_`` of the
-    regressor holds the weight of each row, which is common to outputs that are fitted together. ``std`` and
-    ``noise_variance_`` are those of rows that are not outliers, and ``upper_bound_`` is inf.
+    regressor holds the weight of each row. ``std`` and ``noise_variance_`` are those of rows that are not outliers, and
+    ``upper_bound_`` is inf.
 
-    Memory grows with the number of rows. Not for Dask arrays or Adam. `partial_fit` weights new rows, and keeps the
-    weights of earlier ones. See the user guide, :doc:`/guide/noise`.
+    Memory grows with the number of rows. Dask arrays and Adam do not support this noise. See the user guide,
+    :doc:`/guide/noise`.
 
     Parameters
     ----------
     variance : float, default=None
-        Noise variance at the start of a fit, in squared units of y. If None, it is taken from the data.
+        Noise variance at the start of a fit, in squared units of y. If None, it is estimated from the data.
 
     References
     ----------
@@ -80,12 +80,12 @@ class StudentT(Noise):
         n_outputs : int
             Number of outputs o.
         distances : ndarray of shape (n_rows,)
-            d = Σ_o E(y - g)² / (σ² v) of each row.
+            Distances d = Σ_o E(y - g)² / (σ² v) of each row.
 
         Returns
         -------
         scales : StudentTScales
-            With E[τ] and the probability of being an outlier.
+            Scales with E[τ] and the probability of being an outlier.
         """
         return StudentTScales(n_outputs, distances)
 

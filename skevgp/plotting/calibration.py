@@ -19,11 +19,11 @@ _BAND = "calibration band "
 
 
 class CalibrationDisplay:
-    """Reliability curve: the coverage of central intervals against their probability.
+    """Reliability curve: coverage of central intervals against their probability.
 
-    Intervals are too narrow below the diagonal, and too wide above it. The band contains 95 % of the curves of n
-    independent values at each probability, if standard deviations are right. Rows of a trajectory are not independent.
-    Curves of several models can share axes; the band is then that of the smallest number of values.
+    Intervals are too narrow below the diagonal, and too wide above it. The shaded area contains 95 % of the curves of
+    calibrated models with independent rows. Rows of a trajectory are not independent. If curves of several models share
+    axes, the area is that of the smallest number of values.
 
     Parameters
     ----------
@@ -36,14 +36,16 @@ class CalibrationDisplay:
     n_values : int
         Number of values of each curve.
     names : sequence of str of length n_curves, default=None
-        Names of the outputs, if each has a curve.
+        Names of the outputs, if each output has a curve.
 
     Attributes
     ----------
     ax_ : matplotlib Axes
+        Axes of the plot.
     figure_ : matplotlib Figure
+        Figure of the plot.
     lines_ : list of matplotlib Line2D
-        The curves.
+        Lines of the curves.
 
     See Also
     --------
@@ -102,7 +104,7 @@ class CalibrationDisplay:
         Parameters
         ----------
         estimator : regressor
-            Fitted regressor with ``predict(X, return_std=True)``, or a wrapper of one (see
+            Fitted regressor with ``predict(X, return_std=True)``, or a wrapper of such a regressor (see
             `skevgp.metrics.make_std_scorer`).
         X : array-like of shape (n_samples, n_features)
             Rows that were not in the fit.
@@ -113,7 +115,7 @@ class CalibrationDisplay:
         output_names : sequence of str of length n_outputs, default=None
             Names of the outputs for ``per_output``. If None, output 0, output 1, ...
         n_levels : int, default=101
-            Probabilities at which the curves are evaluated, at least 2.
+            Number of probabilities at which the curves are evaluated, at least 2.
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         label : str, default=None
@@ -167,7 +169,7 @@ class CalibrationDisplay:
         output_names : sequence of str of length n_outputs, default=None
             Names of the outputs for ``per_output``. If None, output 0, output 1, ...
         n_levels : int, default=101
-            Probabilities at which the curves are evaluated, at least 2.
+            Number of probabilities at which the curves are evaluated, at least 2.
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         label : str, default=None
@@ -183,8 +185,8 @@ class CalibrationDisplay:
         Raises
         ------
         ValueError, TypeError
-            If shapes differ, a value is not finite, a standard deviation is negative, the number of names is not that
-            of the outputs, or ``n_levels`` is not an integer of at least 2.
+            If shapes differ, a value is not finite, or a standard deviation is negative. If the number of names is not
+            that of the outputs, or ``n_levels`` is not an integer of at least 2.
         """
         check_integer(n_levels, "n_levels", minimum=2)
         levels = interval_levels(y_true, y_pred, std)

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 class CoefficientDisplay:
-    """Prior and posterior weights of the explicit features, with bars of standard deviations.
+    """Prior and posterior weights of the explicit features, with error bars.
 
-    Posteriors are also given as numbers at the right, because a bar may be shorter than its symbol.
+    The plot also shows posteriors as numbers, because a bar may be shorter than its symbol.
 
     Parameters
     ----------
@@ -28,7 +28,9 @@ class CoefficientDisplay:
     Attributes
     ----------
     ax_ : matplotlib Axes
+        Axes of the plot.
     figure_ : matplotlib Figure
+        Figure of the plot.
 
     See Also
     --------

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class FeatureReportDisplay:
-    """Loss of held-out log density without each group of features, with bars of two standard errors.
+    """Loss of held-out log density without each group of features, with error bars of two standard errors.
 
     Parameters
     ----------
@@ -27,7 +27,9 @@ class FeatureReportDisplay:
     Attributes
     ----------
     ax_ : matplotlib Axes
+        Axes of the plot.
     figure_ : matplotlib Figure
+        Figure of the plot.
 
     See Also
     --------

@@ -19,23 +19,25 @@ from ._style import axes_of, free_color
 
 
 class LearningCurveDisplay:
-    """Test score against the number of training rows: mean and range of several runs, as in Figure 6 of the paper.
+    """Test score against the number of training rows, as in Figure 6 of the paper.
 
-    Curves of several models can share axes.
+    The plot shows the mean and the range of several runs. Curves of several models can share axes.
 
     Parameters
     ----------
     n_rows : ndarray of shape (n_sizes,)
         Numbers of training rows, ascending.
     scores : ndarray of shape (n_sizes, n_runs)
-        Scores on test rows; NaN if a run is missing.
+        Scores on test rows. They are NaN if a run is missing.
     score_name : str, default="prediction error"
         Label of the vertical axis.
 
     Attributes
     ----------
     ax_ : matplotlib Axes
+        Axes of the plot.
     figure_ : matplotlib Figure
+        Figure of the plot.
 
     See Also
     --------
@@ -102,14 +104,14 @@ class LearningCurveDisplay:
         sizes : array-like of shape (n_sizes,)
             Numbers of groups in the training sets, ascending, from 1 to all groups.
         groups : array-like of shape (n_samples,), default=None
-            Labels of the trajectory of each row, as in `make_dynamics`. They are passed to ``fit`` if it takes groups.
-            If None, each row is a group.
+            Labels of the trajectory of each row, as in `make_dynamics`. ``fit`` gets them too, if it takes groups. If
+            None, each row is a group.
         n_runs : int, default=4
             Number of random orders of the groups, at least 1.
         score : callable, default=prediction_error
             Function ``score(y_test, y_pred) -> float``.
         random_state : int, RandomState instance or None, default=None
-            Seed of the orders. The estimator has its own ``random_state``.
+            Seed of the orders. The estimator keeps its own ``random_state``.
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         log_scale : bool, default=None
@@ -162,7 +164,7 @@ class LearningCurveDisplay:
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         log_scale : bool, default=None
-            Whether both axes are logarithmic. If None, they are if all scores are positive.
+            Whether both axes are logarithmic. If None, this is the case if all scores are positive.
         label : str, default=None
             Name of the line, for ``display.ax_.legend()``.
         color : str, default=None

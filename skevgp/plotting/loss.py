@@ -11,7 +11,7 @@ from ._style import axes_of, free_color
 
 
 class LossDisplay:
-    """The bound on the log marginal likelihood after each iteration of a fit.
+    """Bound on the log marginal likelihood after each iteration of a fit.
 
     Curves of several fits can share axes. With the same rows and features, the model with the higher bound is better.
 
@@ -25,8 +25,11 @@ class LossDisplay:
     Attributes
     ----------
     ax_ : matplotlib Axes
+        Axes of the plot.
     figure_ : matplotlib Figure
+        Figure of the plot.
     line_ : matplotlib Line2D
+        Line of the bound.
 
     See Also
     --------
@@ -89,16 +92,15 @@ class LossDisplay:
     def plot(self, ax: Any = None, *, gap: bool = False, label: str | None = None, color: str | None = None) -> Self:
         """Draw the display.
 
-        Without ``gap``, the vertical axis does not show the first quarter of the iterations, because its large gain
-        would hide all later ones.
+        Without ``gap``, the vertical axis leaves out the first quarter of the iterations, because its large gain would
+        hide all later gains.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         gap : bool, default=False
-            Whether to draw the distance of each iteration to the best one on a logarithmic scale, which shows the last
-            part of a fit.
+            Whether to draw the distance to the best bound on a logarithmic scale, which shows the last part of a fit.
         label : str, default=None
             Name of the line, for ``display.ax_.legend()``.
         color : str, default=None

@@ -17,7 +17,7 @@ def _one_output(y: ArrayLike, output: int) -> np.ndarray:
 
 
 class PosteriorDisplay:
-    """Predicted mean with a band of standard deviations, along one axis.
+    """Predicted mean with its credible interval, along one axis.
 
     Parameters
     ----------
@@ -35,7 +35,9 @@ class PosteriorDisplay:
     Attributes
     ----------
     ax_ : matplotlib Axes
+        Axes of the plot.
     figure_ : matplotlib Figure
+        Figure of the plot.
 
     See Also
     --------
@@ -107,7 +109,7 @@ class PosteriorDisplay:
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         n_std : float, default=2.0
-            Half width of the band, in standard deviations.
+            Half width of the interval, in standard deviations.
         label : str, default="mean"
             Name of the line of the mean, for ``display.ax_.legend()``.
 
@@ -119,8 +121,8 @@ class PosteriorDisplay:
         Raises
         ------
         ValueError
-            If y or x does not have a value per row of X, only one of x_train and y_train is given, their lengths
-            differ, or there is no such output.
+            If y or x does not have a value for each row of X, or there is no such output. If x_train and y_train differ
+            in length, or only one of them is given.
         """
         check_is_fitted(estimator)
         mean, std = (part.reshape(len(part), -1) for part in estimator.predict(X, return_std=True))
@@ -154,7 +156,7 @@ class PosteriorDisplay:
         ax : matplotlib Axes, default=None
             Axes to draw on. If None, new axes.
         n_std : float, default=2.0
-            Half width of the band, in standard deviations.
+            Half width of the interval, in standard deviations.
         label : str, default="mean"
             Name of the line of the mean, for ``display.ax_.legend()``.
 

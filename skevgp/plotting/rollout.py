@@ -15,7 +15,9 @@ from ._style import BLUE, ORANGE
 
 
 class RolloutDisplay:
-    """Predictions of `rollout` with a panel for each state: mean, band, a few samples, and the true states.
+    """Predictions of `rollout`, with a panel for each state.
+
+    Each panel shows the mean with its credible interval, a few samples, and the true states.
 
     Parameters
     ----------
@@ -35,8 +37,9 @@ class RolloutDisplay:
     Attributes
     ----------
     axes_ : ndarray of shape (n_panels,)
-        matplotlib's Axes.
+        Axes of the panels.
     figure_ : matplotlib Figure
+        Figure of the plot.
 
     See Also
     --------
@@ -109,7 +112,7 @@ class RolloutDisplay:
         axes : matplotlib Axes or sequence of them, default=None
             Axes to draw on, one for each state. If None, a new figure.
         n_std : float, default=2.0
-            Half width of the bands, in standard deviations.
+            Half width of the intervals, in standard deviations.
         n_samples : int, default=10
             Maximum number of samples to draw.
         label : str, default="mean"
@@ -123,8 +126,8 @@ class RolloutDisplay:
         Raises
         ------
         ValueError, TypeError
-            If there is no such state or initial state, truth or names do not fit the rollout, or the number of axes is
-            not that of the states.
+            If there is no such state or initial state, or truth or names do not fit the rollout. If the number of axes
+            is not that of the states.
         """
         own = _of_one(ahead, index)
         n_steps, n_states = own.mean.shape
@@ -157,7 +160,7 @@ class RolloutDisplay:
         axes : matplotlib Axes or sequence of them, default=None
             Axes to draw on, one for each panel. If None, a new figure.
         n_std : float, default=2.0
-            Half width of the bands, in standard deviations.
+            Half width of the intervals, in standard deviations.
         n_samples : int, default=10
             Maximum number of samples to draw.
         label : str, default="mean"

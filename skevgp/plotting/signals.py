@@ -24,19 +24,19 @@ _MARGIN = 0.25  # above and below the processed signals, as a share of a panel's
 
 
 class SignalsDisplay:
-    """Velocities, accelerations and torques of a log: recorded and processed signals, and the cuts.
+    """Recorded and processed velocities, accelerations and torques of a log, with the cuts.
 
     The vertical axes fit the processed signals, because recorded accelerations are mostly noise. If the file has no
-    accelerations, differences of velocities are drawn. Prismatic joints have m instead of rad and N instead of N m.
+    accelerations, differences of velocities are drawn. Read m and N instead of rad and N m for prismatic joints.
 
     Parameters
     ----------
     raw, processed : Bunch
-        Signals ``time`` (n,), ``velocity``, ``acceleration`` and ``torque``, each (n, n_joints) or None if it was not
-        recorded. Raw signals have ``position`` (n, n_joints), and processed ones ``why`` (n,).
+        Signals ``time`` (n,), and ``velocity``, ``acceleration`` and ``torque`` of shape (n, n_joints). A signal that
+        was not recorded is None. Raw signals also have ``position`` (n, n_joints), and processed signals ``why`` (n,).
     cuts : list of (float, float, str)
-        First and last second of each cut, and its reason: ``"gap"``, ``"jump"``, ``"rest"``, ``"edge"`` or
-        ``"too short"``.
+        First and last second of each cut, and its reason: ``"gap"``, ``"jump"``, ``"rest"``, ``"edge"`` or ``"too
+        short"``.
     joint_names : sequence of str of length n_joints
         Titles of the columns.
     title : str, default=None
@@ -45,8 +45,9 @@ class SignalsDisplay:
     Attributes
     ----------
     axes_ : ndarray of shape (3, n_joints)
-        matplotlib's Axes: velocities, accelerations and torques, a column for each joint.
+        Axes of velocities, accelerations and torques, with a column for each joint.
     figure_ : matplotlib Figure
+        Figure of the plot.
 
     See Also
     --------
@@ -98,7 +99,7 @@ class SignalsDisplay:
         joints : int, str or sequence of them, default=None
             Joints to draw, by index or by name. If None, all joints.
         axes : array of matplotlib Axes of shape (3, n_joints), default=None
-            Axes to draw on, for one joint also of shape (3,). If None, a new figure.
+            Axes to draw on. For one joint, the shape may be (3,). If None, a new figure.
 
         Returns
         -------
@@ -108,7 +109,7 @@ class SignalsDisplay:
         Raises
         ------
         ValueError
-            If there is no such file or joint, or axes are of another shape.
+            If there is no such file or joint, or axes have another shape.
         """
         n_files = len(log.recordings)
         if file not in range(-n_files, n_files):
@@ -130,7 +131,7 @@ class SignalsDisplay:
         Parameters
         ----------
         axes : array of matplotlib Axes of shape (3, n_joints), default=None
-            Axes to draw on, for one joint also of shape (3,). If None, a new figure.
+            Axes to draw on. For one joint, the shape may be (3,). If None, a new figure.
 
         Returns
         -------
@@ -140,7 +141,7 @@ class SignalsDisplay:
         Raises
         ------
         ValueError
-            If axes are of another shape.
+            If axes have another shape.
         """
         panels = _axes(axes, len(self.joint_names))
         for row, (name, label) in enumerate(_PANELS.items()):

@@ -33,57 +33,47 @@ Robot = Any  # str | os.PathLike | System | pinocchio.Model: Pinocchio may not b
 
 
 def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
-    """A robot as a Pinocchio model.
+    """Load a robot as a Pinocchio model.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model
-        One of `list_robots`: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``,
-        ``"acrobot"``, ``"iiwa14"``) or, with the package example-robot-data, one of its robots (``"panda"``,
-        ``"ur5"``, ...); the path of a URDF file; or a model, which is checked.
+        Name of `list_robots`, path of a URDF file, or a model, which is checked.
     joints : sequence of str, default=None
-        Names of the joints that move, in the order of the robot: those that a log has, for example. All other joints
-        are locked at position 0 (rad or m), or at the limit nearest to 0 if 0 is outside of their limits. Their links
-        become part of the link before them. If None, all joints move.
+        Names of the joints that move, in the order of the robot, such as those of a log. All other joints are locked at
+        position 0, or at the limit nearest to 0. Their links become part of the link before them. If None, all joints
+        move.
 
     Returns
     -------
     model : pinocchio.Model
-        With a fixed base and ``nq == nv``: a continuous joint's position is its angle (where Pinocchio's own loader
-        has its cosine and sine). A joint of a URDF file that mimics another moves on its own, with its own motor.
-        Reflected rotor inertias are in ``armature``. `skevgp.datasets.simulate` also heeds viscous ``damping`` and the
-        limits of effort; a joint whose both limits are 0 has no motor, unless all are 0 (then none is known). A lower
-        limit that was never set is the upper one's opposite.
+        Model with a fixed base and ``nq == nv``. The position of a continuous joint is its angle. A joint that mimics
+        another one moves on its own. Reflected rotor inertias are in ``armature``. `skevgp.datasets.simulate` applies
+        viscous ``damping`` and effort limits. A joint whose effort limits are both 0 has no motor, unless all limits
+        are 0.
 
     Raises
     ------
     ImportError
-        If Pinocchio is not installed; the message gives the pip command.
+        If Pinocchio is not installed. The message gives the pip command.
     ValueError
-        If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
-        joint moves, a joint is neither revolute nor prismatic (a floating base, a ball joint, a mimic joint), or a
-        number of the model makes no sense (not finite, a negative mass, armature, damping or dry friction, an axis
-        that is not of length 1 or, in a file, has no direction, negative masses of fixed links that are not smaller
-        than the mass that they are fixed to). If moments of inertia are so far below 0 that the mass matrix is not
-        positive definite. The message names the joint or the link, and the number. If ``joints`` is empty, has a name
-        twice, a name that the robot does not have, or another order than the robot, or if none of ``joints`` has a
-        motor.
+        If no robot has this name, or the file does not exist or is not a URDF. If no joint moves, or a joint is neither
+        revolute nor prismatic. If a number of the model is unphysical, such as a negative mass, or the mass matrix is
+        not positive definite. If ``joints`` is empty, has unknown or repeated names or another order than the robot, or
+        if none of ``joints`` has a motor. The message names the joint or the link, and the number.
     TypeError
-        If ``robot`` is none of the above.
+        If ``robot`` has another type.
 
     Warns
     -----
     RobotModelWarning
-        If no body can have the moments of inertia of a link: an eigenvalue is negative or larger than the sum of the
-        other two (triangle inequality). There is no warning where the rounding of the file's digits explains this:
-        0.001 stands for 0.0005 to 0.0015. A model in memory has no digits, and 0.5 % count as rounding. If a file has
-        numbers that are not used: a negative limit of effort or velocity, limits of position of which the lower is
-        above the upper, or a joint to mimic that the file does not have. If a link of a file has a negative mass, and
-        the body that it is fixed to has not.
+        If no body can have the moments of inertia of a link, because they violate the triangle inequality by more than
+        the rounding of their digits. If a file has numbers that are not used, such as a negative limit. If a link of a
+        file has a negative mass.
 
     See Also
     --------
-    list_robots : The names.
+    list_robots : List the names.
 
     Examples
     --------
@@ -140,19 +130,17 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
 
 
 def list_robots() -> list[str]:
-    """The names that `load_robot` knows.
+    """List the names that `load_robot` knows.
 
     Returns
     -------
     names : list of str
-        The systems of the paper (of the cartpole two, see `make_dynamics`), then what the installed package
-        example-robot-data brings, sorted: each URDF file with a joint that moves, by its name without ``_robot``; where
-        two have the same, with its folder in front. Legged robots and drones come with the trunk welded to the world.
-        ``"romeo"``, ``"romeo_laas_small"`` and the three that end with ``bravo7_gripper`` have joints that move no
-        mass: they cannot be simulated, and `NominalDynamics` refuses them. The neck of ``"icub"`` has hardly any
-        inertia, and its accelerations are large. `load_robot` warns of three: ``"romeo_small"`` and
-        ``"romeo_laas_small"`` have moments of inertia that no body can have, and joints of ``"alex_psyonic_hands"``
-        mimic joints that it does not have.
+        Systems of the paper, then the robots of the installed package example-robot-data.
+
+    Notes
+    -----
+    The trunk of legged robots and drones is fixed to the world. :doc:`Bring a URDF </howto/urdf>` names the robots that
+    cannot be simulated, because some of their joints move no mass.
 
     Examples
     --------

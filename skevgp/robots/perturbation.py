@@ -14,9 +14,9 @@ from .loading import Robot, known_robot, load_robot
 def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.random.RandomState | None = None) -> Any:
     """Copy a robot's model with random errors of masses, centres of mass, inertias and armatures.
 
-    Each mass, each coordinate of a centre of mass in its joint's frame, each link's inertia about its centre of mass
-    and each armature is multiplied by its own ``1 + scale * U(-1, 1)``. All moments of a link's inertia have the same
-    factor, so that the link stays physical. Joints, damping and limits do not change.
+    Each mass, each coordinate of a centre of mass, each inertia and each armature is multiplied by an independent
+    factor ``1 + scale * U(-1, 1)``. All moments of inertia of a link have the same factor, so that the link stays
+    physical. Joints, damping and limits do not change.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.ra
     scale : float, default=0.2
         Largest relative error, in [0, 1).
     random_state : int, RandomState instance or None, default=None
-        Seed of the factors, which are drawn link by link from the base on.
+        Seed of the factors.
 
     Returns
     -------

@@ -21,7 +21,7 @@ _WINDOW, _FEWEST = 50, 1500
 
 
 class Adam(MiniBatchSolver):
-    """Adam on mini-batches over all parameters, including those of q: the solver of the paper.
+    """Adam on mini-batches over all parameters, including those of q, as in the paper.
 
     Parameters
     ----------
@@ -31,24 +31,26 @@ class Adam(MiniBatchSolver):
         First step size.
     natural_gradient : bool, default=False
         Whether to move q by natural gradients (Hensman et al. 2013), which needs ``posterior="full"``. Adam then moves
-        kernel, noise and inducing points only. For a million rows, use ``Adam(batch_size=2000, natural_gradient=True)``
-        with ``max_iter=20000``.
+        kernel, noise and inducing points only. For a million rows, use ``Adam(batch_size=2000,
+        natural_gradient=True)``.
     n_restarts : int, default=0
         Number of further fits from other starts, as in `LBFGS`.
     callback : callable, default=None
-        Function callback(step, lower_bound, outputs), called once per step with the bound of a mini-batch. See `LBFGS`.
+        Function ``callback(step, lower_bound, outputs)``, called once per step with the bound of a mini-batch. See
+        `LBFGS`.
     schedule : {"cosine", "constant"}, default="cosine"
-        Step size: it falls to zero along half a cosine, or it is constant until the bound is flat and falls in the last
-        steps only.
+        Schedule of the step size. If ``"cosine"``, it falls to zero along half a cosine. If ``"constant"``, it falls in
+        the last steps only.
 
     posterior : {"full", "diagonal"}, default="full"
-        Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
+        Covariance of q. If ``"full"``, q is one joint Gaussian of inducing values and weights. If ``"diagonal"``, it is
+        diagonal in both, as in the paper.
     bound : {"titsias", "tight"}, default="titsias"
-        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025).
-        At the same parameters the tight bound is never lower, and predictions are the same. See :doc:`/guide/bounds`.
+        Lower bound that is maximised, of Titsias (2009) or of Titsias (2025). At the same parameters the tight bound is
+        at least as high, and predictions are the same. See :doc:`/guide/bounds`.
     tol : float or "auto", default="auto"
-        Tolerance in nats; ``"auto"`` is 0.01. Adam begins its last steps when the median loss over a third of the steps
-        changes by less than this, or by no more than chance.
+        Tolerance in nats. Adam begins its last steps when the median loss over a third of the steps changes by less. If
+        ``"auto"``, 0.01.
     max_time : float, default=None
         Number of seconds until steps end, as in `LBFGS`.
 
@@ -131,7 +133,7 @@ class Adam(MiniBatchSolver):
         Parameters
         ----------
         objective : callable
-            Function x -> (loss, gradient) of the next mini-batch at each call.
+            Function x -> (loss, gradient). Each call uses the next mini-batch.
         start : ndarray of shape (size,)
             Start point.
         limits : tuple of ndarray of shape (size,)
@@ -143,7 +145,7 @@ class Adam(MiniBatchSolver):
         monitor : Monitor
             Object that is notified of each step, and may end the steps.
         pace : callable, default=None
-            Function pace(share), called before each step with its size as a share of the first.
+            Function ``pace(share)``, called before each step with its size as a share of the first.
 
         Returns
         -------

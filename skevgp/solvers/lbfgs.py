@@ -32,29 +32,29 @@ class Descent:
 
 
 class LBFGS(Solver):
-    """L-BFGS on the bound with q at its optimum: the best solver for most fits.
+    """L-BFGS on the bound with q at its optimum. Use it for most fits.
 
     Parameters
     ----------
     n_restarts : int, default=0
-        Number of further fits from other starts, with other inducing points, kernel and noise. The fit with the best
-        bound is kept. Starts are drawn log-uniformly within the bounds around the first start.
+        Number of further fits from random starts of inducing points, kernel and noise. The fit with the best bound is
+        kept. Inducing points that ``inducing_init`` gives stay the same.
     callback : callable, default=None
-        Function callback(iteration, lower_bound, outputs), called once per iteration. ``outputs`` are the columns of y
-        that the bound belongs to. Raise StopIteration or KeyboardInterrupt to end the fit with the best parameters so
-        far.
+        Function ``callback(iteration, lower_bound, outputs)``, called once per iteration. ``outputs`` are the columns
+        of y that the bound belongs to. Raise StopIteration to end the fit with the best parameters so far.
 
     posterior : {"full", "diagonal"}, default="full"
-        Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
+        Covariance of q. If ``"full"``, q is one joint Gaussian of inducing values and weights. If ``"diagonal"``, it is
+        diagonal in both, as in the paper.
     bound : {"titsias", "tight"}, default="titsias"
-        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025).
-        At the same parameters the tight bound is never lower, and predictions are the same. See :doc:`/guide/bounds`.
+        Lower bound that is maximised, of Titsias (2009) or of Titsias (2025). At the same parameters the tight bound is
+        at least as high, and predictions are the same. See :doc:`/guide/bounds`.
     tol : float or "auto", default="auto"
-        Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row gains less,
-        and stops when such a start gains no more. ``"auto"`` is 0.0015 % of the gain so far, and at least 0.01.
+        Tolerance in nats. L-BFGS restarts from its best point when three iterations in a row gain less, and stops when
+        a restart gains no more. If ``"auto"``, 0.0015 % of the gain over features and noise alone, and at least 0.01.
     max_time : float, default=None
         Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
-        calibration by ``noise_cv`` is skipped. Passes over the rows before and after the iterations are not cut short.
+        calibration by ``noise_cv`` is skipped. If None, there is no limit.
     max_inducing : int, default=1000
         Maximum number of inducing points of ``n_inducing="auto"``.
 
@@ -67,11 +67,7 @@ class LBFGS(Solver):
 
     Notes
     -----
-    Restarts keep inducing points that ``inducing_init`` gives. The gain of ``tol="auto"`` is that over features and
-    noise alone. If the fit begins on a sample of the rows, the callback gets the bound of the sample times the number
-    of rows over the size of the sample. ``outputs`` is a range, or a tuple if a group has gaps. ``clone`` copies a
-    callable object, but not a function. Independent models share ``max_time``, and finding groups of outputs
-    (``sharing="auto"``) takes at most half of it. See the user guide, :doc:`/guide/solvers`.
+    See the user guide, :doc:`/guide/solvers`.
 
     Examples
     --------
@@ -136,13 +132,13 @@ class LBFGS(Solver):
         max_iter : int
             Maximum number of iterations over all starts.
         tolerance : Tolerance
-            A start ends when each of ``descent.patience`` iterations in a row gains less. The solver ends when a whole
-            start gains no more.
+            Tolerance of the loss. A start ends when ``descent.patience`` iterations in a row gain less. The solver ends
+            when a whole start gains no more.
         monitor : Monitor
             Object that is notified of each iteration, and may end the iterations.
         curvature : tuple, default=None
-            A function as ``objective``, whose curvature at the start gives the scale of steps, and an integer for each
-            coordinate, equal for those that have the same scale. If None, x is not scaled.
+            Function like ``objective``, whose curvature at the start gives the scale of steps, and an integer for each
+            coordinate. Coordinates with the same integer have the same scale. If None, x is not scaled.
 
         Returns
         -------

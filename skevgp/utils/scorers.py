@@ -39,16 +39,16 @@ class StdScorer:
 def make_std_scorer(score_func: Metric, *, greater_is_better: bool = True, **kwargs: Any) -> StdScorer:
     """Make a scorer from a metric of the predicted mean and standard deviation.
 
-    Use it for ``scoring=`` of `cross_validate`, `GridSearchCV`, `HalvingGridSearchCV` and `permutation_importance`. It
-    corresponds to `sklearn.metrics.make_scorer` for metrics of the mean. The scorers `neg_nlpd`, `neg_crps` and
-    `neg_calibration_error` are ready to use.
+    Pass the scorer as ``scoring`` to `cross_validate`, `GridSearchCV` or `permutation_importance`. For metrics of the
+    mean, use `sklearn.metrics.make_scorer`. The scorers `neg_nlpd`, `neg_crps` and `neg_calibration_error` are ready to
+    use.
 
     Parameters
     ----------
     score_func : callable
         Metric ``score_func(y_true, y_pred, std, **kwargs) -> float``, such as `crps`.
     greater_is_better : bool, default=True
-        Whether a high number is good. If False, the scorer returns minus the number, as scikit-learn's scorers do.
+        Whether a high number is good. If False, the scorer returns minus the number.
     **kwargs : dict
         Arguments for ``score_func``.
 
@@ -65,9 +65,9 @@ def make_std_scorer(score_func: Metric, *, greater_is_better: bool = True, **kwa
 
     Notes
     -----
-    The estimator may be the last step of a Pipeline, or inside a search, a MultiOutputRegressor, or a
-    TransformedTargetRegressor with one of scikit-learn's scalers of columns. Other transformations of y, such as the
-    logarithm, have no Gaussian of y, and a RegressorChain passes on means only. The std of a GaussianProcessRegressor
+    The estimator may be the last step of a Pipeline, or inside a search or a MultiOutputRegressor. It may also be
+    inside a TransformedTargetRegressor with one of scikit-learn's scalers. Other transformations of y, such as the
+    logarithm, do not give a Gaussian of y. A RegressorChain passes on means only. The std of a GaussianProcessRegressor
     has the noise of a WhiteKernel, but not ``alpha``.
 
     Examples

@@ -41,8 +41,8 @@ class StatefulEstimator(BaseEstimator):
         if _is_ours(self) and version != __version__:
             warn_user(
                 f"{type(self).__name__} is a pickle of skevgp {version or '(version unknown)'}, and this is "
-                f"{__version__}: it may fail, or predict something else. Fit it again, or load it with that version "
-                "and save it with skevgp.io.save, whose files are checked when they are read.",
+                f"{__version__}. It may fail, or predict other values. Fit it again, or load it with that version "
+                "and save it with skevgp.io.save.",
                 InconsistentVersionWarning,
             )
         super().__setstate__(state)

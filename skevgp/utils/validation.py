@@ -59,7 +59,7 @@ def is_plain(estimator: Any, X: Any) -> bool:
 def check_fitted(estimator: Any) -> None:
     """Raise NotFittedError before fit, also for estimators that can predict from their prior."""
     if hasattr(estimator, "__sklearn_is_fitted__") and not estimator.__sklearn_is_fitted__():
-        raise NotFittedError(f"This {type(estimator).__name__} instance is not fitted yet: call fit before.")
+        raise NotFittedError(f"This {type(estimator).__name__} instance is not fitted yet. Call fit first.")
     check_is_fitted(estimator)
 
 
@@ -117,7 +117,7 @@ def _check_kind(values: Any, name: str) -> None:
     if name == "y" and issparse(values):
         raise TypeError(f"y must be a dense array; got a sparse matrix of the shape {values.shape}. Use y.toarray().")
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
-        raise ValueError(f"{name} must have no masked values: leave these rows out, or impute them.")
+        raise ValueError(f"{name} must have no masked values. Remove these rows, or impute the values.")
     types = getattr(values, "dtypes", None) if is_frame(values) else [getattr(values, "dtype", None)]
     if types is not None and all(getattr(own, "kind", "") in ("M", "m") for own in types):
         raise ValueError(f"{name} must be real numbers; got dates or times.")

@@ -98,14 +98,14 @@ def test_noise_is_left_out_if_that_is_asked_for(exported):
 
 @pytest.mark.parametrize("name", ["int", "restrict", "sin", "fmaf", "x", "casadi_int", "NAN"])
 def test_reserved_c_name_raises(name, tmp_path):
-    with pytest.raises(ValueError, match=f"name='{name}' means something else in C"):
+    with pytest.raises(ValueError, match=f"name='{name}' is a reserved word of C"):
         fitted(sparse()).to_c(tmp_path, name)
     assert not list(tmp_path.iterdir())
 
 
 def test_missing_folder_raises(tmp_path):
     model = fitted(sparse())
-    with pytest.raises(ValueError, match=r"path=.*there is no folder .*missing"):
+    with pytest.raises(ValueError, match=r"path=.*the folder .*missing.* does not exist"):
         model.to_c(tmp_path / "missing" / "model.c")
-    with pytest.raises(ValueError, match=r"there is no folder .*missing"):
+    with pytest.raises(ValueError, match=r"the folder .*missing.* does not exist"):
         model.to_c(tmp_path / "missing")

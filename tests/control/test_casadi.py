@@ -79,7 +79,9 @@ def test_without_casadi_there_is_the_pip_command(method, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("name", ["two words", "1st", "", "a__b", None, 3])
 def test_invalid_casadi_name_raises(name):
-    with pytest.raises(ValueError, match=r"name must be letters, digits and single underscores.*got"):
+    with pytest.raises(
+        ValueError, match=r"name must have a letter first, then letters, digits and single underscores.*got"
+    ):
         fitted(sparse()).to_casadi(name)
 
 

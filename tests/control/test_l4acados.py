@@ -136,7 +136,7 @@ def test_columns_that_the_model_was_not_fitted_to(rows):
 
 @pytest.mark.parametrize("columns", [[0, 1], [0, 1, 1], [0, 1, -1], [0.0, 1.0, 2.0], [[0, 1, 2]], 3])
 def test_invalid_columns_raise(model, columns):
-    with pytest.raises(ValueError, match=r"columns=.*: pass one index for each of the 3 columns"):
+    with pytest.raises(ValueError, match=r"columns=.* must have a different index, from 0, for each of the 3 columns"):
         model.to_l4acados(columns)
 
 

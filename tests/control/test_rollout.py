@@ -217,7 +217,7 @@ def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_o
         ((Z0, np.full((5, 1), np.inf)), {}, "U must be finite"),
         ((Z0, np.zeros((0, 1))), {}, "U has no steps"),
         ((Z0, np.zeros((3, 5, 1))), {}, "n_batch=1"),
-        ((Z0, np.zeros((5, 1))), {"n_steps": 5}, "n_steps is for a controller"),
+        ((Z0, np.zeros((5, 1))), {"n_steps": 5}, "Pass n_steps only with a controller"),
         ((Z0, lambda z, t: [0.0]), {}, "n_steps is needed"),
         ((Z0, lambda z, t: [0.0]), {"n_steps": 0}, "n_steps"),
         ((Z0, lambda z, t: [0.0, 1.0]), {"n_steps": 3}, "The controller must return inputs of shape"),

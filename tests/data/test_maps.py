@@ -55,7 +55,7 @@ def test_invalid_transformer_raises(name, no_map):
 @pytest.mark.parametrize("name", ["feature_map", "kernel_map"])
 @pytest.mark.parametrize("kernel", [RBF(2.0), ConstantKernel() * RBF(), FunctionKernel(lambda X, Z: X @ Z.T)], ids=str)
 def test_kernel_in_place_of_a_map_is_sent_where_it_belongs(name, kernel):
-    with pytest.raises(TypeError, match=f"^{re.escape(f'{name}={kernel!r} is a kernel: give it as kernel=.')}$"):
+    with pytest.raises(TypeError, match=f"^{re.escape(f'{name}={kernel!r} is a kernel. Pass it as kernel=.')}$"):
         fit_map(kernel, X, Y, name)
 
 

@@ -30,7 +30,7 @@ def test_noise_is_a_fraction_of_each_targets_scatter():
         ({"system": "acrobat"}, "Did you mean 'acrobot'"),
         (
             {"duration": 1.0},
-            "duration is the time of a controlled move; 'pendulum' is driven by random inputs. Got 1.0",
+            "duration is the time of a controlled move, but 'pendulum' is driven by random inputs; got 1.0",
         ),
         ({"system": "iiwa14", "duration": 0.0}, "duration must be finite and above 0.0; got 0.0"),
         ({"n_trajectories": 0}, "n_trajectories must be at least 1; got 0"),
@@ -96,7 +96,7 @@ def test_joint_without_motor_is_swung_at_random():
     [("panda", {"dt": 0.1}, "finger"), ("so100", {"dt": 0.1}, "gripper"), ("panda", {"duration": 0.2}, "finger")],
 )
 def test_moves_that_run_away_raise(name, arguments, joint):
-    with pytest.raises(ValueError, match=rf"run away in step \d+, at .*{joint}.*unstable at this dt of .*Lower dt"):
+    with pytest.raises(ValueError, match=rf"unstable in step \d+, at .*{joint}.*Lower dt"):
         make_dynamics(name, 10, 50, random_state=0, **arguments)
 
 

@@ -69,7 +69,7 @@ def test_ctrl_c_keeps_what_each_model_has(n_threads):
     assert len(done.models) == 2
     assert done.n_iter <= 2
     assert done.messages == (
-        f"The fit was interrupted after {done.n_iter} iterations; the best parameters so far are kept.",
+        f"The fit was interrupted after {done.n_iter} iterations. The best parameters so far are kept.",
     )
     assert np.isfinite(done.lower_bound)
 

@@ -62,7 +62,7 @@ def taken(X, Z, values=1.0):
             "values_bounds of 'lengthscale' must be two",
         ),
         (FunctionKernel(smooth, {"weight": 0.0}), "must be positive"),
-        (FunctionKernel(lambda X, Z: np.exp(-cdist(X, Z))), "<lambda> cannot be traced by autograd: write it with"),
+        (FunctionKernel(lambda X, Z: np.exp(-cdist(X, Z))), "<lambda> cannot be traced by autograd. Write it with"),
         (FunctionKernel(lambda X, Z: X @ Z.T * np.nan), r"kernel: k\(X, X\) is not finite"),
         (FunctionKernel(lambda X, Z: X), "must return an array of shape"),
     ],

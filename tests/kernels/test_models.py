@@ -68,7 +68,7 @@ def test_value_of_a_bound_that_depends_on_the_diagonal():
         (FunctionKernel(lambda X, Z: X @ Z.T + X[:, :1]), "must be symmetric"),
         (FunctionKernel(lambda X, Z: X @ Z.T / 0.0), "not finite"),
         (FunctionKernel(lambda X, Z: np.exp(X @ Z.T)[:-1]), r"<lambda> must return an array of shape \(7, 7\); it has"),
-        (FunctionKernel(polynomial, diagonal=lambda X, bias: X[:, 0] ** 2), "does not return the k"),
+        (FunctionKernel(polynomial, diagonal=lambda X, bias: X[:, 0] ** 2), "must return the diagonal of k"),
         (FunctionKernel(lambda X, Z: 1.0), r"must return an array of shape \(7, 7\); it has \(\)"),
         (FunctionKernel(lambda X, Z: np.array([[float(x @ z) for z in Z] for x in X])), "cannot be traced by autograd"),
     ],

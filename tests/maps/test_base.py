@@ -83,7 +83,9 @@ def test_differences_are_close_to_the_derivative():
 @pytest.mark.parametrize("shape", [(200, 10), (200, 10, 4), (100, 10, 5)])
 def test_jacobian_of_another_shape_raises(shape, monkeypatch):
     monkeypatch.setattr(WithJacobian, "jacobian", lambda self, X: np.zeros(shape))
-    with pytest.raises(ValueError, match=r"jacobian of WithJacobian\(\) must return \(n_samples, n_features_out, "):
+    with pytest.raises(
+        ValueError, match=r"jacobian of WithJacobian\(\) must return the shape \(n_samples, n_features_out, "
+    ):
         as_map(fitted(WithJacobian())).jacobian(rows())
 
 

@@ -84,7 +84,7 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
     """Return the type of a topic's messages, the times at which they were received (ns), and the messages."""
     if path.suffix.lower() != ".mcap" and set("#?%") & set(str(path)):
         # rosbags makes the path part of an address as it is, by which SQLite may find another file.
-        raise ValueError("SQLite recordings whose path has #, ? or % in it cannot be read: rename it.")
+        raise ValueError("the path of an SQLite recording must not have #, ? or % in it. Rename the file.")
     rosbag2 = require("rosbags.rosbag2", "Reading rosbag2 files")
     typesys = require("rosbags.typesys", "Reading rosbag2 files")
     try:
@@ -127,7 +127,7 @@ def _topic(topics: dict[str, str], topic: str | None) -> str:
     """Choose the topic that is asked for, or the only one with joint states or trajectories."""
     known = [name for name, kind in topics.items() if kind in (_STATES, _TRAJECTORY)]
     if topic is not None and topic not in known:
-        raise _TopicError(f"topic={topic!r} is none of those with joint states or trajectories; it has {topics}.")
+        raise _TopicError(f"topic={topic!r} is not a topic with joint states or trajectories; the file has {topics}.")
     if topic is None and len(known) != 1:
         many = f"several topics have such messages, give one of them as topic: {known}"
         raise _TopicError(
@@ -148,7 +148,7 @@ def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
             if not set(names) <= set(most) or (whole[0] < index < whole[-1] and names and not _twice(names, most))
         } | {tuple(sorted(most))}
         if len({frozenset(names) for names in differing}) > 1:
-            raise ValueError(f"messages are of different joints, say by joints which you mean: {sorted(differing)}.")
+            raise ValueError(f"messages have different joints, {sorted(differing)}. Choose some by joints=[...].")
         return list(dict.fromkeys(most))
     if not any(set(joints) <= set(names) for names in sets):
         known = sorted({name for names in sets for name in names})

@@ -73,7 +73,7 @@ def wishes(wrap: Any, names: Sequence[str]) -> list[Wish]:
     if isinstance(wrap, Mapping):
         unknown = sorted(set(wrap) - set(names))
         if unknown:
-            raise ValueError(f"wrap has {unknown}, which are none of the joints {list(names)}.")
+            raise ValueError(f"wrap names {unknown}, which are not among the joints {list(names)}.")
         return [_plain(wrap.get(name, "auto")) for name in names]
     if isinstance(wrap, (list, tuple, np.ndarray)):
         if len(wrap) != len(names):
@@ -112,9 +112,9 @@ def kinds_of(robot: Any, names: Sequence[str], named: bool) -> list[Kind]:
         return ["turns" if known[name] else "bounded" for name in names]
     if len(names) != len(known):
         raise ValueError(
-            f"robot has the joints {list(known)}, and the log {list(names)}: give joints of the robot by joints=, or "
-            "as many. If only some joints were recorded, give the robot as load_robot(robot, joints=[...]), which "
-            "locks the others."
+            f"The joints of robot are {list(known)}, but those of the log are {list(names)}. Name the joints of the "
+            "log by joints=[...]. If only some joints were recorded, pass robot=load_robot(robot, joints=[...]), "
+            "which locks the others."
         )
     return ["turns" if turns else "bounded" for turns in known.values()]
 

@@ -92,80 +92,55 @@ def load_log(
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Load a robot's own logs as data for inverse dynamics: [q, q̇, q̈] and the torques.
 
-    Reads tables (.csv, .txt, .tsv, also with .gz) and rosbag2 recordings (.db3, .mcap, or their folder), without ROS.
-    With each file this is done:
-
-    1. Rows that ``keep`` leaves out are dropped, and so are incomplete rows at the beginning and the end. Rows are
-       sorted by time.
-    2. Efforts are multiplied by ``gains``.
-    3. Angles that wrap are unwrapped. The recording is cut into pieces at steps above ``max_gap`` and at other jumps of
-       a position.
-    4. Signals of motors become signals of joints by ``coupling``.
-    5. Recorded velocities and accelerations are compared with the positions. A contradiction is an error.
-    6. Efforts are moved earlier by ``delay``.
-    7. Signals are interpolated to a regular grid and filtered forth and back, without a shift in time.
-    8. Velocities and accelerations that were not recorded are central differences.
-    9. The ends of each piece, and rest, are cut.
-
-    :doc:`Read a log </howto/logs>` describes each step.
+    The function reads tables and rosbag2 recordings, resamples and filters the signals, computes missing derivatives,
+    and cuts gaps and rest. :doc:`Read a log </howto/logs>` describes each step.
 
     Parameters
     ----------
     path : str, path-like or sequence of them
         One file or several. Each file is a group. All files have the same joints.
     columns : dict, default=None
-        Columns of a table that hold ``"time"``, ``"position"``, ``"effort"`` or ``"current"`` and, if they are there,
-        ``"velocity"`` and ``"acceleration"``. Each is a number from 0, a name, a pattern of names such as
-        ``"actual_q_*"``, or a sequence of those, in the order of the joints.
+        Columns of ``"time"``, ``"position"``, ``"effort"`` or ``"current"``, and optionally ``"velocity"`` and
+        ``"acceleration"``, in a table. Each is a number from 0, a name, a pattern such as ``"actual_q_*"``, or a
+        sequence of these.
     time_unit : {"s", "ms", "us", "ns"}, default="s"
-        Unit of a table's times.
+        Unit of the times in a table.
     decimal : {".", ","}, default="."
         Decimal sign of a table.
     topic : str, default=None
-        Topic of a rosbag2 recording, with messages of type ``sensor_msgs/msg/JointState`` or
-        ``trajectory_msgs/msg/JointTrajectory``. If None, the only topic with such messages.
+        Topic of a rosbag2 recording with joint states or joint trajectories. If None, the only such topic.
     joints : sequence of str, default=None
-        Joints of a rosbag2 recording, in the order wanted; messages without them are passed over. If None, the joints
-        of the messages. For a table: names for its joints, by default q1, q2, ...
+        Joints to read from a rosbag2 recording, or names for the joints of a table. If None, all joints.
     gains : float or array-like of shape (n_joints,), default=1.0
-        Torque per effort: 1 where efforts are in N m, else N m per A.
+        Torque per effort: 1 if efforts are in N m, or N m per A.
     coupling : array-like of shape (n_joints, n_joints), default=None
-        Matrix A with q_joint = A q_motor, where the file has the signals of motors: ratios of gears, belts and
-        differentials. It must be invertible. Velocities and accelerations are multiplied by A too, and torques by the
-        inverse of its transpose, which keeps the power. ``gains`` and ``wrap`` are those of the motors, and angles of
-        motors are unwrapped as if there were no limits. If None, the file has the signals of joints.
+        Matrix A with q_joint = A q_motor, if the file has the signals of motors. If None, the file has the signals of
+        joints.
     delay : float, array-like of shape (n_joints,) or "auto", default=0.0
-        Time by which efforts lag behind positions in the recording, s. The effort recorded at t belongs to the motion
-        at t - ``delay``. It is negative if positions lag behind efforts. ``"auto"`` estimates one delay for each file,
-        between -0.1 s and 0.1 s, and needs ``robot``. With ``coupling``, an array has the delays of the joints.
+        Time by which efforts lag behind positions in the recording, s. If ``"auto"``, one delay is estimated for each
+        file, which needs ``robot``.
     velocity : {"recorded", "derive"}, default="recorded"
-        Whether to use recorded velocities, where there are any, or differences of the positions. ``"derive"`` ignores
-        recorded velocities, even if they are incomplete or NaN.
+        Whether to use recorded velocities, if there are any, or differences of the positions.
     acceleration : {"recorded", "derive"}, default="recorded"
-        The same for accelerations.
+        Whether to use recorded accelerations, if there are any, or differences of the velocities.
     wrap : {"auto", True, False}, float, sequence or dict of them, default="auto"
-        Whether to unwrap angles that start again after a turn; a number is the period. ``"auto"`` unwraps jumps that
-        are clearly turns of 2π or 360, ``True`` also less clear ones, and ``False`` takes positions as they are,
-        without cuts at their jumps. A sequence has a value for each joint, and a dict has values by the joints' names.
+        Whether to unwrap angles that start again after a turn. A number is the period. If ``"auto"``, only clear turns
+        are unwrapped.
     robot : str, path-like, System or pinocchio.Model, default=None
-        Robot, as in `load_robot`. ``wrap="auto"`` then never unwraps a joint with limits or a prismatic joint, and
-        ``delay="auto"`` is possible. Joints are matched by ``joints`` or the names in a rosbag2 recording, or else by
-        their order.
+        Robot, as in `load_robot`. ``wrap="auto"`` then knows the limits of the joints.
     keep : slice, tuple or sequence of them, default=None
-        Rows to read: ``slice(first, stop)`` counts rows or messages from 0, and ``(first, last)`` are seconds since the
-        first row, either of which may be None. A header does not count as a row, a row of units does. For several
-        files, a list with one value for each; None reads all rows.
+        Rows to read: ``slice(first, stop)`` counts rows from 0, and ``(first, last)`` are seconds since the first row.
+        For several files, pass a list. If None, all rows are read.
     dt : float, default=0.01
-        Step of the grid, s. If None, the recorded times are kept; their steps must differ by less than 5 %.
+        Step of the grid, s. If None, the recorded times are kept. Their steps must differ by less than 5 %.
     cutoff : float, default=5.0
-        Cutoff frequency of the filter, Hz, below half the rate of the recording and of the grid. If None, signals are
-        filtered only against aliasing, where the grid is coarser than the recording.
+        Cutoff frequency of the filter, Hz. If None, signals are filtered only against aliasing.
     max_gap : float, default=None
         Longest step that is no gap, s. If None, 5 times the median step.
     rest_velocity : float, default=0.01
-        Velocity in rad/s or m/s, at least 0, below which a joint is at rest. 0 cuts no rest.
+        Velocity in rad/s or m/s below which a joint is at rest. If 0, no rest is cut.
     rest_time : float, default=0.5
-        Shortest rest of all joints that is cut, s, at least 0.
+        Shortest rest of all joints that is cut, s.
     return_X_y : bool, default=False
         Whether to return ``(data, target)`` instead of a Bunch.
 
@@ -174,64 +149,53 @@ def load_log(
     log : :class:`~sklearn.utils.Bunch`
         Dictionary-like object with
 
-        - ``data`` : ndarray of shape (n_rows, 3 * n_joints): positions (rad or m), velocities (per s) and accelerations
-          (per s²);
-        - ``target`` : ndarray of shape (n_rows, n_joints): torques (N m) or forces (N);
-        - ``groups`` : ndarray of shape (n_rows,): the file of each row, for `GroupKFold`;
-        - ``pieces`` : ndarray of shape (n_rows,): numbers that differ where a gap or rest lies between rows;
-        - ``time`` : ndarray of shape (n_rows,): s since the first row of its file;
-        - ``recordings`` : list of Bunch, one per file, with
+        - ``data`` : ndarray of shape (n_rows, 3 * n_joints), with positions (rad or m), velocities and accelerations;
+        - ``target`` : ndarray of shape (n_rows, n_joints), with torques (N m) or forces (N);
+        - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
+        - ``pieces`` : ndarray of shape (n_rows,), with numbers that differ if a gap or rest lies between rows;
+        - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
+        - ``recordings`` : list of Bunch, one for each file, with
 
-          - ``raw`` and ``processed``: each a Bunch of ``time``, ``position``, ``velocity``, ``acceleration`` and
-            ``torque``. Raw signals are None where they were not recorded or ignored. Raw positions are unwrapped, raw
-            signals are those of the joints, and raw torques are at the times of their record. ``processed`` also has
-            ``why`` of shape (n,): ``"edge"`` or ``"rest"`` for rows that were cut, and empty for the rows in ``data``;
-          - ``cuts``: list of (first second, last second, ``"gap"``, ``"jump"``, ``"edge"``, ``"rest"`` or
-            ``"too short"``);
-          - ``wrapped``: dict of the number of jumps of each joint that were unwrapped; ``periods``: dict of their
-            periods, without joints that never wrap; with ``coupling``, they are those of the motors;
-          - ``delay``: ndarray of shape (n_joints,) of the delays of the efforts, s;
-          - ``start``: the first row's time by the file's own clock, s;
-          - ``n_repeated``: number of rows with the time of another row; ``n_incomplete``: number of incomplete rows at
-            the beginning and the end; and ``filename``;
+          - ``raw`` and ``processed``: Bunch of ``time``, ``position``, ``velocity``, ``acceleration`` and ``torque``.
+            ``processed`` also has ``why``, which is ``"edge"`` or ``"rest"`` for rows that were cut;
+          - ``cuts``: list of (first second, last second, reason);
+          - ``wrapped`` and ``periods``: dict of the number of unwrapped jumps, and of their periods, for each joint;
+          - ``delay``: ndarray of shape (n_joints,), with the delays of the efforts in s;
+          - ``start``: time of the first row by the clock of the file, s;
+          - ``n_repeated`` and ``n_incomplete``: number of rows with the time of another row, and of incomplete rows at
+            both ends;
+          - ``filename``;
 
         - ``joint_names``, ``feature_names``, ``target_names``, ``filenames``, ``DESCR``.
     (data, target) : tuple of ndarray
-        If ``return_X_y``.
+        Returned only if ``return_X_y`` is True.
 
     Raises
     ------
     ValueError
-        If a file cannot be read, lacks columns, a topic or joints, has missing values between complete rows, a clock
-        that goes back, or signals that contradict each other, is too short for the filter or all at rest. Also if files
-        differ in their joints, or an argument does not fit them. An error about a file begins with its name.
+        If a file cannot be read, or lacks columns, a topic or joints. If its signals contradict each other, are too
+        short for the filter, or are all at rest. If files differ in their joints, or an argument does not fit them. An
+        error about a file begins with its name.
     TypeError
         If an argument is of the wrong type.
     OSError
-        If a table is not there or must not be read.
+        If a file is missing or must not be read.
     ImportError
-        If a rosbag2 file is given and rosbags is not installed, or a robot or ``delay="auto"`` needs Pinocchio and it
-        is not installed; the message gives the pip command.
+        If rosbags or Pinocchio is needed and not installed. The message gives the pip command.
 
     Warns
     -----
     RobotModelWarning
-        If ``delay="auto"`` finds a delay above 0.002 s. It is corrected.
+        If ``delay="auto"`` finds a delay above 0.002 s. The delay is corrected.
 
     See Also
     --------
-    log_transitions : The same for forward dynamics.
-    skevgp.plotting.SignalsDisplay : Draws what was done to the signals.
+    log_transitions : Data for forward dynamics.
+    skevgp.plotting.SignalsDisplay : Plot of recorded and processed signals.
 
     Notes
     -----
     Neighbouring rows of filtered signals are nearly the same. Cross-validate by ``groups``, never by rows.
-
-    Units of positions are not converted. Degrees stay degrees, and are unwrapped by 360.
-
-    ``delay="auto"`` shifts the efforts by each delay, and regresses them on the dynamics of the robot with friction.
-    The regression finds masses and friction, so that only lengths and axes of the robot must be right. Positions must
-    be in rad or m. The delay is 0 if none is clearly better.
 
     Examples
     --------
@@ -252,8 +216,6 @@ def load_log(
     (['q1', 'dq1/dt', 'd2q1/dt2'], ['u_q1'])
     >>> bool(np.abs(log.data[:, 2] + 4.0 * log.data[:, 0]).max() < 0.02)  # q̈ = -4 q
     True
-    >>> bool(np.abs(log.target[:, 0] - 5.0 + 3.0 * log.data[:, 0]).max() < 0.01)
-    True
     """
     how = Processing(dt, cutoff, max_gap, rest_velocity, rest_time)
     if not isinstance(time_unit, str) or time_unit not in SECONDS:
@@ -268,7 +230,7 @@ def load_log(
         if delay != "auto":
             raise ValueError(f'delay must be "auto", a number, or one for each joint, s; got {delay!r}.')
         if robot is None:
-            raise ValueError('delay="auto" needs robot=...: its dynamics tell which delay fits the motion.')
+            raise ValueError('delay="auto" needs robot=..., whose dynamics determine the delay.')
     if not isinstance(decimal, str) or decimal not in (".", ","):
         raise ValueError(f"decimal must be '.' or ','; got {decimal!r}.")
     if joints is not None and (
@@ -287,7 +249,7 @@ def load_log(
         with naming(file):
             if file.is_dir() or file.suffix.lower() in BAGS:
                 if asked is not None:
-                    raise ValueError("columns are those of a table; in a rosbag2 recording choose topic and joints.")
+                    raise ValueError("columns is for tables. For a rosbag2 recording, choose topic and joints.")
                 read = read_bag(file, topic, names, ignored)
             else:
                 read = _table(file, asked, time_unit, topic, names, decimal)
@@ -315,9 +277,9 @@ def _files(path: Any, keep: Any) -> tuple[list[Path], list[Any]]:
         raise TypeError(f"path must be a path or a list of paths; got {path!r}.")
     files = [Path(one) for one in path]
     if not files:
-        raise ValueError("path must be a file or several; got none.")
+        raise ValueError("path must be one file or several; got an empty list.")
     if keep is not None and (not isinstance(keep, list) or len(keep) != len(files)):
-        raise ValueError(f"keep must be a list with one for each of the {len(files)} files; got {keep!r}.")
+        raise ValueError(f"keep must be a list with one value for each of the {len(files)} files; got {keep!r}.")
     return files, [None] * len(files) if keep is None else [_check_keep(one) for one in keep]
 
 
@@ -347,7 +309,7 @@ def _kept(time: np.ndarray, keep: Keep | None) -> np.ndarray:
     else:
         kept = rows[keep or slice(None)]
     if not len(kept):
-        raise ValueError(f"keep={keep!r} leaves none of its {len(time)} rows of {np.nanmax(time):g} s.")
+        raise ValueError(f"keep={keep!r} selects none of the {len(time)} rows, which last {np.nanmax(time):g} s.")
     return kept
 
 
@@ -365,9 +327,9 @@ def _table(
         hint = " Convert it with: rosbags-convert --src in.bag --dst out" if ending == ".bag" else ""
         raise ValueError(f"its name must end in one of {', '.join([*TABLES, *BAGS])}.{hint}")
     if columns is None:
-        raise ValueError("columns must say where a table has its signals, by numbers from 0 or by names.")
+        raise ValueError("pass columns=..., which says by numbers from 0 or by names where a table has its signals.")
     if topic is not None:
-        raise ValueError(f"topic={topic!r} is for rosbag2 recordings; this is a table.")
+        raise ValueError(f"topic={topic!r} is for rosbag2 recordings, but the file is a table.")
     read = read_table(file, columns, time_unit, decimal)
     if names is not None and len(names) != len(read.joint_names):
         raise ValueError(f"it has {len(read.joint_names)} joints; expected {len(names)}: {names}.")
@@ -463,8 +425,8 @@ def _warn_of_delays(recordings: list[Bunch]) -> None:
     if late:
         told = ", ".join(f"{1e3 * delay:.1f} ms in {filename}" for filename, delay in late.items())
         warn_user(
-            f"Efforts lag behind positions by {told} (below 0: they are ahead). This was corrected. Pass delay=0.0 to "
-            "keep the times.",
+            f"Efforts lag behind positions by {told}. A negative lag means that they are ahead. The lag was corrected. "
+            "Pass delay=0.0 to keep the recorded times.",
             RobotModelWarning,
         )
 

@@ -42,9 +42,7 @@ class Processing:
     def check_frequencies(self, step: float) -> None:
         """Raise if the grid or the filter does not fit a recording with this median step."""
         if self.dt is not None and self.dt < _FINEST * step:
-            raise ValueError(
-                f"dt={self.dt:g} s is far below the recording's step of {step:g} s: it would show nothing."
-            )
+            raise ValueError(f"dt={self.dt:g} s is far below the recording's step of {step:g} s. Pass a larger dt.")
         nyquist = 0.5 / max(step, self.dt or 0.0)
         if self.cutoff is not None and self.cutoff >= nyquist:
             raise ValueError(
@@ -78,11 +76,11 @@ def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple
                 why = "the driver may never fill it"
                 raise ValueError(f"the {name}{joint} is not finite in any row kept: {why}.{hint}")
             row = np.flatnonzero(spoilt.any(axis=1))[0]
-            raise ValueError(f"the {name} of row {row} of those kept is not finite.{hint}")
+            raise ValueError(f"the {name} is not finite in row {row} of the rows kept.{hint}")
     order = np.argsort(raw.time, kind="stable")
     steps = np.diff(raw.time[order])
     if not (steps > 0.0).any():
-        raise ValueError(f"it has {len(order)} rows, and not two different times among them.")
+        raise ValueError(f"its {len(order)} rows do not have two different times.")
     step = float(np.median(steps[steps > 0.0]))
     gap = _GAP * step if max_gap is None else max_gap
     late = np.maximum.accumulate(raw.time) - raw.time
@@ -167,7 +165,7 @@ def process(
             f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends.{jumping}"
         )
     if not any((why == "").any() for why in reasons):
-        raise ValueError(f"all of it is at rest: no joint is faster than rest_velocity={how.rest_velocity:g}.")
+        raise ValueError(f"all rows are at rest: no joint is faster than rest_velocity={how.rest_velocity:g}.")
     return Processed(_joined(parts), np.concatenate(reasons), sorted(cuts))
 
 
@@ -222,7 +220,7 @@ def _regular(piece: Signals, step: float) -> Signals:
     if irregular > _JITTER * step:
         raise ValueError(
             f"dt=None keeps the recorded times, but they are not regular: steps differ from their median of "
-            f"{step:g} s by up to {irregular:g} s. Give dt."
+            f"{step:g} s by up to {irregular:g} s. Pass dt."
         )
     return piece
 

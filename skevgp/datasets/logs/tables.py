@@ -34,7 +34,7 @@ _COMMAS = str.maketrans(",.", ".?")
 def check_columns(columns: Any) -> dict[str, list[int | str]]:
     """Check the argument `columns`; return a list of columns for each signal."""
     if not isinstance(columns, Mapping):
-        raise TypeError(f"columns must be a dict that says which columns hold {', '.join(_NAMES)}; got {columns!r}.")
+        raise TypeError(f"columns must be a dict with the columns of {', '.join(_NAMES)}; got {columns!r}.")
     columns = {name: value for name, value in columns.items() if value is not None}
     unknown, missing = set(columns) - set(_NAMES), set(_REQUIRED) - set(columns)
     if unknown or missing or len(set(_EFFORT) & set(columns)) != 1:
@@ -79,7 +79,7 @@ def read_table(
                 lines = chain([first], lines)
             values, problems = _numbers(lines, delimiter, decimal, read)
     except (gzip.BadGzipFile, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"it is no text, or its compression is broken ({error}).") from error
+        raise ValueError(f"it is not a text file, or its compression is broken ({error}).") from error
     if not len(values):
         raise ValueError("it has no rows.")
     signals = {name: values[:, np.searchsorted(list(read), several)] for name, several in places.items()}
@@ -217,7 +217,7 @@ def _places(asked: list[int | str], header: list[str], n_columns: int, name: str
             pattern = one.replace("[", "[[]")  # a bracket, as in q[0]
             found = [place for place, title in enumerate(header) if title == one or fnmatchcase(title, pattern)]
             if not found:
-                raise ValueError(f"columns[{name!r}] asks for {one!r}, which is none of the columns {header}.")
+                raise ValueError(f"columns[{name!r}] asks for {one!r}, which is not among the columns {header}.")
             if len(found) > 1 and "*" not in one and "?" not in one:
                 raise ValueError(f"columns[{name!r}] asks for {one!r}, but several columns have this name.")
         elif one >= n_columns:

@@ -16,20 +16,20 @@ def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[False]
 @overload
 def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[True]) -> tuple[np.ndarray, np.ndarray]: ...
 def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Turn logs into state transitions, each with its own time step: data for forward dynamics.
+    """Turn logs into state transitions with their own time steps, as data for forward dynamics.
 
     A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
-    the target. Nothing is resampled or filtered. Angles are unwrapped as by `load_log`. Transitions across a gap,
-    across a jump of a position or through rest, and rows with the time of another row, are left out. With a ``delay``
-    of `load_log`, torques are the means of the efforts that were recorded later than the transition by the delay.
+    the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
+    gap, a jump of a position or rest are left out, and so are rows with the time of another row. With a ``delay`` of
+    `load_log`, torques are means of efforts that were recorded later than the transition by the delay.
 
     Parameters
     ----------
     log : Bunch
         Logs, as returned by `load_log`.
     stride : int, default=1
-        Number of recorded rows from a state to the next, at least 1. Above 1, transitions follow each other without
-        overlap. The torque is then the mean of the rows between, weighted by their durations.
+        Number of recorded rows from a state to the next, at least 1. Transitions do not overlap. The torque is the mean
+        of the rows between, weighted by their durations.
     return_X_y : bool, default=False
         Whether to return ``(data, target)`` instead of a Bunch.
 
@@ -38,22 +38,21 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     transitions : :class:`~sklearn.utils.Bunch`
         Dictionary-like object with
 
-        - ``data`` : ndarray of shape (n_rows, 3 * n_joints + 1): positions (rad or m), velocities (per s), torques
-          (N m or N) and, last, the time to the target, ``"dt"`` (s, above 0);
-        - ``target`` : ndarray of shape (n_rows, 2 * n_joints): positions and velocities after ``dt``;
-        - ``groups`` : ndarray of shape (n_rows,): the file of each row, for `GroupKFold`;
-        - ``time`` : ndarray of shape (n_rows,): s since the first row of its file;
+        - ``data`` : ndarray of shape (n_rows, 3 * n_joints + 1), with positions, velocities, torques and, in the last
+          column, the time to the target ``"dt"``, in SI units;
+        - ``target`` : ndarray of shape (n_rows, 2 * n_joints), with positions and velocities after ``dt``;
+        - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
+        - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
         - ``joint_names``, ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
-        If ``return_X_y``.
+        Returned only if ``return_X_y`` is True.
 
     Raises
     ------
     ValueError
-        If ``stride`` is below 1, no velocities were recorded or they were ignored by ``velocity="derive"``, or no
-        transition remains.
+        If ``stride`` is below 1, the log has no recorded velocities, or no transition remains.
     TypeError
-        If ``log`` is not what `load_log` returns, or ``stride`` not an integer.
+        If ``log`` is not a result of `load_log`, or ``stride`` is not an integer.
 
     See Also
     --------
@@ -61,12 +60,12 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     Notes
     -----
-    The torque of a row is held until the next row. The torque of the next row is not used: where the robot is
-    controlled, it depends on the noise of the target.
+    The torque of a row is held until the next row. The torque of the next row is not used, because a controller
+    computes it from the noisy target.
 
     Examples
     --------
-    A mass of 2 kg that a force pushes to and fro, recorded at irregular times:
+    A mass of 2 kg that a force pushes back and forth, recorded at irregular times:
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -87,11 +86,11 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     """
     check_integer(stride, "stride", minimum=1)
     if not isinstance(log, Bunch) or "recordings" not in log:
-        raise TypeError(f"log must be what load_log returns; got {type(log).__name__}.")
+        raise TypeError(f"log must be a result of load_log; got {type(log).__name__}.")
     parts = [_transitions(recording, stride) for recording in log.recordings]
     lengths = [len(part) for part in parts]
     if not any(lengths):
-        raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest: lower stride={stride}.")
+        raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest. Lower stride={stride}.")
     rows, n = np.vstack(parts), len(log.joint_names)
     data, target, time = rows[:, : 3 * n + 1], rows[:, 3 * n + 1 : -1], rows[:, -1]
     if return_X_y:
@@ -117,8 +116,8 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
     raw = recording.raw
     if raw.velocity is None:
         raise ValueError(
-            f"{recording.filename}: there are no recorded velocities, which are half of the state. Differences of "
-            'unfiltered positions are too noisy to replace them, so velocity="derive" of load_log leaves none.'
+            f"{recording.filename}: there are no recorded velocities, which the states need. Differences of "
+            'unfiltered positions are too noisy to replace them. velocity="derive" of load_log ignores velocities.'
         )
     steps = np.diff(raw.time)
     whole = np.ones(len(steps), dtype=bool)

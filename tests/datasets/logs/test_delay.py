@@ -103,7 +103,7 @@ def test_delay_beyond_those_tried_raises(tmp_path):
         ({"delay": "some"}, "delay must be \"auto\", a number, or one for each joint, s; got 'some'"),
         ({"delay": np.nan}, "log.csv: delay must be a finite number, or one for each of the 2 joints; got nan"),
         ({"delay": [0.1]}, r"log.csv: delay must be a finite number, or one for each of the 2 joints; got \[0.1\]"),
-        ({"delay": "auto", "robot": "acrobot", "rest_velocity": 99.0}, "log.csv: all of it is at rest"),
+        ({"delay": "auto", "robot": "acrobot", "rest_velocity": 99.0}, "log.csv: all rows are at rest"),
     ],
 )
 def test_invalid_delay_raises(tmp_path, arguments, message):

@@ -79,7 +79,7 @@ def test_times_have_a_unit(tmp_path, expected, unit, seconds):
         ({**BY_NUMBER, "time": 8}, r"columns\['time'\] asks for column 8, but there are 0 to 7 only"),
         (
             {**BY_NUMBER, "position": "p_*"},
-            r"columns\['position'\] asks for 'p_\*', which is none of the columns \['t'",
+            r"columns\['position'\] asks for 'p_\*', which is not among the columns \['t'",
         ),
         ({**BY_NUMBER, "position": ["q_1"]}, "there are 1 columns of position, and 2 of velocity"),
         ({**BY_NUMBER, "current": [6, 6]}, r"columns\['current'\] has a column twice: \[6, 6\]"),
@@ -126,7 +126,10 @@ def test_names_need_a_header(tmp_path):
 
 @pytest.mark.parametrize(
     ("quote", "message"),
-    [("", r"row 1 lacks the position .*'a{79} in column 1 \(q\) is no number"), ('"', "it is no text, .*field limit")],
+    [
+        ("", r"row 1 lacks the position .*'a{79} in column 1 \(q\) is no number"),
+        ('"', "it is not a text file, .*field limit"),
+    ],
 )
 def test_cell_of_a_million_letters_raises(tmp_path, quote, message):
     file = tmp_path / "log.csv"
@@ -155,7 +158,7 @@ def test_name_of_two_columns_raises(tmp_path):
         (b"t,q,u\n0,,2\n1,,2\n2,3,4\n", "2 of its 3 rows are incomplete: row 0 lacks the position"),
         (b"t;q;u\n0,1;1;2\n", r"row 0 has '0,1' in column 0 \(t\), and decimal='.'. Pass decimal=\",\""),
         (b"t;q;u\n0;1.234,5;2\n", r"row 0 has '1.234,5' in column 1 \(q\).* without separators of thousands"),
-        (b"\xff\xfe\x00\x80", "it is no text, or its compression is broken"),
+        (b"\xff\xfe\x00\x80", "it is not a text file, or its compression is broken"),
     ],
 )
 def test_invalid_table_raises(tmp_path, content, message):
@@ -219,5 +222,5 @@ def test_incomplete_rows_at_the_ends_are_left_out_and_counted(tmp_path, expected
 def test_broken_compression_raises(tmp_path, spoil):
     file = tmp_path / "bad.csv.gz"
     file.write_bytes(spoil(gzip.compress(b"0,1,2\n" * 1000)))
-    with pytest.raises(ValueError, match="bad.csv.gz: it is no text, or its compression is broken"):
+    with pytest.raises(ValueError, match="bad.csv.gz: it is not a text file, or its compression is broken"):
         load_log(file, columns={"time": 0, "position": 1, "effort": 2})

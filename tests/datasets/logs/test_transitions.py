@@ -81,7 +81,7 @@ def test_velocities_must_be_recorded(load):
 
 def test_some_transition_must_remain(load):
     with pytest.raises(
-        ValueError, match="No 1001 rows follow each other without a gap, jump or rest: lower stride=1000"
+        ValueError, match="No 1001 rows follow each other without a gap, jump or rest. Lower stride=1000"
     ):
         log_transitions(load(table_of(T)), stride=1000)
 
@@ -93,5 +93,5 @@ def test_invalid_arguments_raise(load):
     with pytest.raises(TypeError, match="stride must be an integer; got 1.5"):
         log_transitions(log, stride=1.5)
     for wrong in ("log.csv", Bunch(data=log.data)):
-        with pytest.raises(TypeError, match="log must be what load_log returns; got"):
+        with pytest.raises(TypeError, match="log must be a result of load_log; got"):
             log_transitions(wrong)
