@@ -1,5 +1,6 @@
 """Multi-step prediction, against the same done by hand."""
 
+import autograd.numpy as anp
 import numpy as np
 import pandas as pd
 import polars
@@ -15,10 +16,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp.features import LogNormal, ParametricFeatures
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
-
-from ..theta import WAVE
 
 N_STEPS = 12
 QUICK = {"max_iter": 20, "solver": LBFGS(tol=1e6), "random_state": 0}
@@ -42,12 +42,17 @@ def inputs():
     return np.random.RandomState(1).uniform(-1.0, 1.0, (N_STEPS, 1))
 
 
+def pull(X, rate):
+    return anp.sin(rate * X[:, 0])
+
+
+PULL = ParametricFeatures(pull, {"rate": LogNormal(0.8, 0.3)})
 REGRESSORS = {
     "sparse": EVGPRegressor(n_inducing=15, **QUICK),
     "features": EVGPRegressor(FunctionTransformer(), kernel_map=StandardScaler(), n_inducing=15, **QUICK),
     "exact": EGPRegressor(FunctionTransformer(), random_state=0, max_iter=20, tol=1e6),
-    "parameters": EVGPRegressor(WAVE, n_inducing=15, **QUICK),
-    "residual of parameters": ResidualRegressor(EVGPRegressor(WAVE, n_inducing=15, **QUICK)),
+    "parameters": EVGPRegressor(PULL, n_inducing=15, **QUICK),
+    "residual of parameters": ResidualRegressor(EVGPRegressor(PULL, n_inducing=15, **QUICK)),
     "residual": ResidualRegressor(EVGPRegressor(n_inducing=15, **QUICK)),
     "scikit-learn's": GaussianProcessRegressor(RBF(2.0) + WhiteKernel(1e-3), normalize_y=True, optimizer=None),
     "pipeline": make_pipeline(StandardScaler(), EVGPRegressor(n_inducing=15, **QUICK)),
@@ -79,6 +84,8 @@ def test_after_one_step_samples_have_the_predictive_distribution(model, inputs, 
 
 
 def test_without_a_jacobian_differences_do(model, inputs):
+    if hasattr(getattr(model, "regressor_", model), "theta_"):
+        pytest.skip("outputs that share parameters are correlated, which predict alone does not tell")
     ours, found = (rollout(each, Z0, inputs, method="linearized") for each in (model, _Hidden(model)))
     np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
 
