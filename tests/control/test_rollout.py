@@ -84,10 +84,10 @@ def test_after_one_step_samples_have_the_predictive_distribution(model, inputs, 
 
 
 def test_without_a_jacobian_differences_do(model, inputs):
-    if hasattr(getattr(model, "regressor_", model), "theta_"):
-        pytest.skip("outputs that share parameters are correlated, which predict alone does not tell")
+    # Outputs that share parameters are a little correlated, which predict alone does not tell.
+    correlated = hasattr(getattr(model, "regressor_", model), "theta_")
     ours, found = (rollout(each, Z0, inputs, method="linearized") for each in (model, _Hidden(model)))
-    np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-4 if correlated else 1e-8)
 
 
 def test_mean_is_fed_back(model, inputs):
