@@ -22,7 +22,7 @@ from ..fitting.exact import ExactFit
 from ..fitting.fit import Fitted
 from ..fitting.prior import CoefPrior, as_coef_prior, coef_names
 from ..fitting.problem import Problem
-from ..fitting.theta import Calibration, ThetaPosterior, restricted
+from ..fitting.theta import ThetaPosterior, restricted
 from ..kernels.parse import KernelSpec
 from ..noise import as_noise
 from ..noise.base import Noise
@@ -298,17 +298,16 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         problem: Problem,
         spec: KernelSpec,
         fitted: Fitted | ExactFit,
-        calibration: Calibration | None = None,
+        theta: ThetaPosterior | None = None,
     ) -> None:
         """Store the posterior of a fit, and the attributes that describe it."""
         for name in (*_OF_WEIGHTS, *_OF_THETA):
             self.__dict__.pop(name, None)
         maps = replace(data.maps, shapes=problem.shapes)
         self.feature_map_, self.kernel_map_, self._fitted = maps.feature_map, maps.kernel_map, fitted
-        self._theta, found = None, fitted.predictor()
-        if calibration is not None:
-            self.feature_map_, self._theta = maps.feature_map.feature_map, calibration.posterior
-            found = self._theta.predictor(fitted)
+        self._theta, found = theta, fitted.predictor()
+        if theta is not None:
+            self.feature_map_, found = maps.feature_map.feature_map, theta.predictor(fitted)
         self._posterior = Posterior(found, maps)
         self._set_weights_and_noise()
         predictor, prior = self._posterior.predictor, fitted.prior

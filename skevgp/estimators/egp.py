@@ -265,8 +265,8 @@ class EGPRegressor(GaussianProcess):
                 fitted = fit(problem, None, False, "")
                 self._set_posterior(data, problem, problem.spec, fitted)
             else:
-                fitted, spec = calibration.fitted, problem.spec
-                self._set_posterior(calibration.data, calibration.problem, spec, fitted, calibration)
+                data, problem, fitted = calibration.data, calibration.problem, calibration.fitted
+                self._set_posterior(data, problem, problem.spec, fitted, calibration.posterior)
             if vague.any():
                 self.coef_prior_scale_[vague[0] if self.coef_prior_scale_.ndim == 1 else vague] = np.inf
             self._spec = problem.spec

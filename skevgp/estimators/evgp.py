@@ -320,7 +320,8 @@ class EVGPRegressor(GaussianProcess):
                 fitted = fit_to_noisy_inputs(
                     fitted, data, posterior_of, numbers, covariance, refit, monitor, self._columns_changed
                 )
-            self._set_posterior(data, problem, problem.spec, fitted, calibration)
+            theta = None if calibration is None else calibration.posterior
+            self._set_posterior(data, problem, problem.spec, fitted, theta)
             self._set_attributes(fitted, data)
         self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
         if calibration is not None:

@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 
-from ..maps.theta import parts_of_union, steps_of
+from ..maps.sklearn import parts_of_union, steps_of
 from ..utils.sklearn import safe_indexing
 from ..utils.state import StatefulEstimator
 from ..utils.validation import as_floats, check_magnitude

@@ -96,6 +96,7 @@ StepAt = Callable[[np.ndarray, ThetaStep], ThetaStep | None]
 class Calibration:
     """A fit with parameters θ."""
 
+    # The data with the features at the mode of z, and the problem of the last fit.
     data: Dataset
     problem: Problem
     fitted: Any
@@ -321,18 +322,19 @@ class _Calibrator:
 
     def at(self, z: np.ndarray) -> ThetaStep:
         """What the sample says about z at a value, with the noise of the residuals there."""
+        return self._known(self.alone(z, self.noise_at(z)))
+
+    def noise_at(self, z: np.ndarray) -> np.ndarray:
+        """The mean squared residuals (o,) at a value of z, with weights for noise as large as the targets."""
         squares = np.mean(self.targets**2, axis=0)
-        first = self._known(self.alone(z, np.where(squares > 0.0, squares, 1.0)))
-        return self._known(self.alone(z, self.residual_variance(first)))
+        return self.residual_variance(self._known(self.alone(z, np.where(squares > 0.0, squares, 1.0))))
 
     def starts(self, seed: int) -> list[ThetaStep]:
         """Different optima of the features alone, the best one first."""
         q = len(self.theta)
         n_tried = int(np.ceil(np.log2(min(_TRIED * q, _MOST_TRIED))))
         tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(n_tried))
-        squares = np.mean(self.targets**2, axis=0)
-        first = self.alone(np.zeros(q), np.where(squares > 0.0, squares, 1.0))
-        noise = self.residual_variance(self._known(first))
+        noise = self.noise_at(np.zeros(q))
         found = [self.improved(np.zeros(q), noise)]
         values = [self.value_alone(z, noise) for z in tried]
         best = [tried[i] for i in np.argsort(values)[::-1][:_IMPROVED] if np.isfinite(values[i])]
@@ -481,9 +483,9 @@ def calibrate(
         )
     own = _Calibrator(data, problem, theta)
     fitted, before = previous
-    seed, goes_on = rng.randint(np.iinfo(np.int32).max), before is not None and before.theta.names == theta.names
-    if goes_on and before is not None:
-        starts = [own.at(before.z_under(theta.priors))]
+    seed, goes_on = rng.randint(np.iinfo(np.int32).max), False
+    if before is not None and before.theta.names == theta.names:
+        goes_on, starts = True, [own.at(before.z_under(theta.priors))]
     else:
         fitted, starts = None, own.starts(seed)
     step, best = starts[0], -np.inf
@@ -501,7 +503,8 @@ def calibrate(
     trusted = True
     for number in range(1, _FITS + 1):
         at_start = step
-        fitted = fit(own.problem_at(step, own.data_at(step.z)), fitted, False, f"parameters, fit {number}")
+        problem = own.problem_at(step, own.data_at(step.z))
+        fitted = fit(problem, fitted, False, f"parameters, fit {number}")
         ended = monitor.stopped or monitor.out_of_time
         trusted = noise_known and not ended
         if trusted:
@@ -516,7 +519,7 @@ def calibrate(
     posterior = ThetaPosterior.of(found, step, own.together, bend)
     if not trusted or _length(step.newton(), step) > _MOVED:
         posterior = replace(posterior, mean=step.z)
-    return Calibration(at_mode, own.problem_at(step, at_mode), own.finished(step, at_mode, fitted), posterior)
+    return Calibration(at_mode, problem, own.finished(step, at_mode, fitted), posterior)
 
 
 def rough_tol(problem: Problem) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections import UserList
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from scipy.sparse import issparse
@@ -22,12 +22,55 @@ from sklearn.preprocessing import (
     StandardScaler,
 )
 
+from ..data.maps import transformed
 from ..utils.casadi import casadi
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import safe_indexing
 from .base import Identity, Map, NoExpressionError, adapts, as_map, exportable
 
 # --- transformers made of others -------------------------------------------------------------------------------------
+
+
+def steps_of(pipeline: Pipeline) -> list[Any]:
+    """The steps of a pipeline that do something."""
+    return [step for _, step in pipeline.steps if step not in (None, "passthrough")]
+
+
+class PartOfUnion(NamedTuple):
+    """A transformer of a union."""
+
+    name: str
+    transformer: Any
+    # Its input, its columns in the result of the union, and the number that these are multiplied by.
+    rows: Any
+    columns: np.ndarray
+    weight: float
+
+
+def parts_of_union(feature_map: Any, rows: Any) -> Iterator[PartOfUnion]:
+    """The parts of a fitted union, given some rows of its input. Parts of weight 0 are left out: they return 0."""
+    if isinstance(feature_map, FeatureUnion):
+        start = 0
+        for name, part in feature_map.transformer_list:
+            if part == "drop":
+                continue
+            first = safe_indexing(rows, slice(0, 1))
+            width = np.shape(first if part == "passthrough" else transformed(part, first))[-1]
+            weight = _weight(feature_map, name)
+            if weight != 0.0:
+                yield PartOfUnion(name, part, rows, np.arange(start, start + width), weight)
+            start += width
+    elif isinstance(feature_map, ColumnTransformer):
+        for name, part, columns in feature_map.transformers_:
+            own = np.arange(feature_map.output_indices_[name].start, feature_map.output_indices_[name].stop)
+            weight = _weight(feature_map, name)
+            if len(own) and weight != 0.0:
+                yield PartOfUnion(name, part, safe_indexing(rows, columns, axis=1), own, weight)
+
+
+def _weight(union: Any, name: str) -> float:
+    weight = (union.transformer_weights or {}).get(name)
+    return 1.0 if weight is None else float(weight)
 
 
 @adapts(Pipeline)

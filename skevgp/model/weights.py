@@ -16,7 +16,7 @@ priori. To first order, h(x; θ)ᵀβ = hᵀβ + D K (z - ẑ), where K = K(β̂
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,11 +37,6 @@ class WeightLikelihood:
     q: float
     # (p,): the diagonal of the first of the matrices whose difference M is. Its rounding errors are those of M.
     sizes: np.ndarray
-
-    def about(self, change: np.ndarray) -> WeightLikelihood:
-        """The same likelihood about b₀ + change (p,)."""
-        Mc = self.M @ change
-        return replace(self, h=self.h - Mc, q=self.q - float((2.0 * self.h - Mc) @ change))
 
     def in_units(self, unit: float) -> WeightLikelihood:
         """The likelihood of the weights times ``unit``, for a target times ``unit``."""
@@ -191,7 +186,7 @@ def theta_step(
     ``columns`` (d, 2) are the feature and the parameter of each column of D. The weights of D are 0 at ẑ, and those of
     h are taken from ``prior.offset``, as in the likelihoods.
     """
-    # With b = (β, 0) and β = b₀ + C w', w' = w - 0 where w ~ N(-w₀, I) (see `bounds`), the precision of w is
+    # With b = (β, 0) and β = b₀ + C w, where w ~ N(-w₀, I) a priori (see `bounds`), the posterior precision of w is
     # S = I + Σ_o CᵀM C, its mean S⁻¹ (Σ_o Cᵀh - w₀), and log p(y) = ½ |R⁻¹ g|² - ½ log|S| - ½ Σ_o q - ½ |w₀|². The
     # derivative of H in z is that of the columns of D, so that with the residual u = h - M b,
     #
