@@ -36,10 +36,12 @@ SEEN = """return [...document.querySelectorAll('article img')].filter(i => i.get
 
 
 def opened(browser, address, page, theme="light"):
-    browser.get(f"{address}/{page}")
-    browser.execute_script(f"localStorage.setItem('mode', '{theme}'); localStorage.setItem('theme', '{theme}')")
+    # The theme is chosen before the page's own scripts run. After a first page, the next one may not see it at once.
+    choice = {"source": f"localStorage.setItem('mode', '{theme}'); localStorage.setItem('theme', '{theme}')"}
+    script = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", choice)
     browser.get_log("browser")
     browser.get(f"{address}/{page}")
+    browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
     return WebDriverWait(browser, 30)
 
 
