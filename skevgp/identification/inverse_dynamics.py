@@ -56,11 +56,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         + z_j^\top d_j + \varepsilon_j
 
     The weights β = (π, φ) are inertial parameters and friction, with the features of `RigidBodyRegressor`. All joints
-    share them, and their prior mean is the robot's model. c_j is the error of a motor gain. f_j is a sparse Gaussian
-    process (`EVGPRegressor`) of the residual torque, whose inputs x_j are the joint's own signals and load. a_j from 0
-    to 1 is its share in the prediction. d_j are the offset, friction and gain of one move. The noise ε_j is larger at
-    low speeds, where the sign of Coulomb friction is unknown. The user guide explains each term:
-    :doc:`/guide/torques`.
+    share them, and their prior mean is the robot's model. The error of a motor gain is c_j. The sparse Gaussian process
+    f_j (`EVGPRegressor`) learns the residual torque from the joint's own signals and load, x_j. Its share in the
+    prediction is a_j, from 0 to 1. The offset, friction and gain of one move are d_j. The noise ε_j is larger at low
+    speeds, where the sign of Coulomb friction is unknown. The user guide explains each term: :doc:`/guide/torques`.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ def variation(
     z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, known: np.ndarray, rows: Rows
 ) -> Variation:
     """Estimate differences between moves, and the noise within moves, from errors missed (n,) on held-out moves."""
-    # The variance of errors is known (n,), the variance of the predictions, plus noise.
+    # The variance of errors is the sum of `known` (n,), the variance of the predictions, and of the noise.
     #
     # Each move has its own effects d ~ N(0, diag(t)), as in a linear model with random effects. Expectation
     # maximisation finds the most likely t. Rows count less if errors are correlated in time. So slow errors within a
