@@ -319,7 +319,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         named = "".join(f"{cause[0].upper()}{cause[1:]}. " for cause in causes)
         little = ""
         if self._unexplained:
-            little = f" It explains less than half of the variance of the torques of {self._unexplained}."
+            little = f" Less than half of the variance of the torques of {self._unexplained} is explained."
         return (
             f"The robot's model does not fit the torques. {named}{'Otherwise, its' if causes else 'Its'} masses may be "
             "placeholders, or y may have other units. "
