@@ -37,8 +37,8 @@ class DependentRowsWarning(UserWarning):
 class InconsistentVersionWarning(UserWarning):
     """Warning that a model was saved with another version, and may predict other values.
 
-    Loading a pickle, or a file of `skops.io.dump`, of another version of skevgp gives it. `skevgp.io.load` gives it if
-    scikit-learn has another version, and predictions cannot be compared.
+    It appears if a pickle or a file of `skops.io.dump` comes from another version of skevgp. `skevgp.io.load` gives it
+    if the file comes from another version of scikit-learn, and predictions cannot be compared.
 
     See Also
     --------

@@ -170,7 +170,7 @@ def with_masses(arm, factor):
 @pytest.mark.parametrize("factor", [0.01, 0.15])
 def test_placeholder_masses_warn(factor):
     arm = Arm()
-    with pytest.warns(ConvergenceWarning, match="far from what torques say"):
+    with pytest.warns(ConvergenceWarning, match="model does not fit the torques"):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
 
 
@@ -204,7 +204,7 @@ def test_invalid_input_raises(arm):
     with pytest.raises(ValueError, match="Unknown robot"):
         InverseDynamics("ur55").fit(arm.X, arm.y)
     body = RigidBodyRegressor("ur5", parameters={"stiction_velocity": LogNormal(0.01, 1.0)})
-    with pytest.raises(ValueError, match=r"leave the parameters .* at None; got \['stiction_velocity'\]"):
+    with pytest.raises(ValueError, match=r"Leave parameters .* at None; got \['stiction_velocity'\]"):
         InverseDynamics(body).fit(arm.X, arm.y)
     assert not hasattr(model, "coef_")
 
@@ -260,7 +260,7 @@ def test_other_transformers_are_no_robots():
 
 
 def test_invalid_payloads_raise(arm, rigid):
-    with pytest.raises(ValueError, match="y has 2 columns"):
+    with pytest.raises(ValueError, match="y must have 6 columns"):
         rigid.estimate_payload(arm.X, arm.y[:, :2])
     with pytest.raises(ValueError, match="link=6"):
         rigid.estimate_payload(arm.X, arm.y, link=6)

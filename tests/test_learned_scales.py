@@ -145,7 +145,7 @@ def test_exact_likelihood_is_the_dense_one_and_its_slope_that_of_the_log_prior(c
         assert (likelihood(logs + step) - likelihood(logs - step)) / 2e-4 == pytest.approx(log, abs=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:The robot's model is far from what torques say")
+@pytest.mark.filterwarnings("ignore:The robot's model does not fit the torques")
 def test_torques_of_a_machine_that_is_ten_times_heavier_than_its_model():
     arm = Arm("pendulum", error=0.0, noise=0.2)
     truth, light = arm.torque(arm.new), with_masses(arm, 0.1)

@@ -254,7 +254,7 @@ class Posterior:
     # --- what control loops and optimisers call -----------------------------------------------------------------------
 
     def compile(self, include_noise: bool = True) -> CompiledPredictor:
-        """Make a fast predictor for control loops, which does not validate its input.
+        """Make a fast predictor for control loops, without validation of its input.
 
         Parameters
         ----------
@@ -502,8 +502,8 @@ class Posterior:
             int evgp_jacobian(const double *x, double *mean, double *variance,
                               double *mean_jacobian, double *variance_jacobian);
 
-        The functions return 0. A result that is not needed may be NULL. The functions keep no state and use stack
-        memory only, whose size the header gives. Thus they may run in several threads and in an interrupt.
+        The functions return 0. A result that is not needed may be NULL. The functions keep no state and use only stack
+        memory. The header gives its size. Thus they may run in several threads and in an interrupt.
         ``casadi.external("evgp", ...)`` loads the compiled library.
         """
         function = self.to_casadi(name, include_noise=include_noise)

@@ -55,7 +55,7 @@ def rollout(
         - ``"linearized"``: mean and covariance to first order, with independent steps.
         - ``"mean"``: each step starts from the mean of the step before.
     process_noise : {"learned", "none"}, default="learned"
-        Whether to add the learned noise at each step. Use ``"none"`` if the noise was in the measurement of the states.
+        Whether to add the learned noise at each step. Use ``"none"`` if it is noise of the measurement.
     random_state : int, RandomState instance or None, default=None
         Seed of the particles.
 

@@ -80,7 +80,7 @@ def simulate(
     wrap_angles : bool, default=False
         Whether to return revolute positions in [-pi, pi). A controller always gets them unwrapped.
     return_inputs : bool, default=False
-        Whether to return the inputs within the motors' limits too.
+        Whether to return the inputs too, after the effort limits are applied.
     n_jobs : int, default=None
         Number of processes for groups of 64 trajectories. If None, 1; if -1, all cores. The result does not depend on
         it.

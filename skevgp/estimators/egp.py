@@ -104,10 +104,11 @@ class EGPRegressor(GaussianProcess):
     noise_variance_ : float or ndarray of shape (n_outputs,)
         Noise variance σ² in squared units of y.
     log_marginal_likelihood_value_ : float
-        Log marginal likelihood in nats, summed over outputs. With vague weights, it is eq. 2.45 of Rasmussen & Williams
-        (2006).
+        Log marginal likelihood in nats, summed over outputs. With a vague prior of the weights, it is eq. 2.45 of
+        Rasmussen & Williams (2006).
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the log marginal likelihood per iteration, plus minus the log prior density of learned scales of weights.
+        Minus the sum of the log marginal likelihood and the log prior density of learned scales of weights, per
+        iteration.
     n_iter_ : int
         Number of iterations of the best start.
     n_features_in_ : int

@@ -82,7 +82,7 @@ class EVGPRegressor(GaussianProcess):
     noise : {"gaussian", "student-t"}, `skevgp.noise.Gaussian` or `skevgp.noise.StudentT`, default="gaussian"
         Noise model. Use ``"student-t"`` if a few rows are outliers, and ``Gaussian(inputs=...)`` for noise in X.
     discrepancy : {"free", "orthogonal"}, default="free"
-        Whether f may imitate the features, or is orthogonal to them. See :doc:`/guide/parameters`.
+        Whether f may imitate the features (``"free"``), or is orthogonal to them. See :doc:`/guide/parameters`.
     noise_cv : int, default=5
         Number of folds that calibrate signal and noise variance. If None, there is no calibration. See
         :doc:`/guide/noise`.
@@ -342,9 +342,9 @@ class EVGPRegressor(GaussianProcess):
     ) -> Self:
         """Add new rows to the posterior exactly. Kernel, noise and inducing points stay the same.
 
-        The first call is a `fit`. After Adam, q moves to its optimum. If the noise variance is below 1e-8 of the signal
-        variance, ``lower_bound_`` and ``upper_bound_`` are accurate to about a nat. Features with parameters stay
-        linearised at the ``theta_`` of `fit`. Call `fit` with all rows if ``theta_`` moves far.
+        The first call is a `fit`. After a fit by Adam, the approximate posterior q first moves to its optimum. If the
+        noise variance is below 1e-8 of the signal variance, the two bounds are accurate to about a nat. Features with
+        parameters stay linearised at the ``theta_`` of `fit`. Call `fit` with all rows if ``theta_`` moves far.
 
         Parameters
         ----------

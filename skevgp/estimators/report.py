@@ -75,7 +75,7 @@ class FeatureReport:
     Parameters
     ----------
     groups : tuple of FeatureGroup
-        One for each group of weights, and one for all features together.
+        An entry for each group of weights, and one for all features together.
     held_out : str
         Kind of the held-out data: "trajectories", "rows" or "" (none).
 
@@ -196,10 +196,10 @@ def feature_report(
     The loss of a group is the log density per held-out row with the group, minus that without it. It is summed over
     outputs and averaged over trajectories, or over rows without ``groups``.
 
-    A group helps or hurts if the losses differ from 0 by Wilcoxon's signed-rank test at the level 0.05, and by 0.01
-    nats. The test needs at least six trajectories. Otherwise the group does nothing if the mean loss is within 0.05
-    nats of 0 by two standard errors. In all other cases the verdict is "unclear", and also if mean and median of the
-    losses have different signs.
+    A group helps or hurts if Wilcoxon's signed-rank test of its losses is significant at the level 0.05. The test needs
+    at least six trajectories. Also, the mean loss must exceed 0.01 nats in size and have the sign of the median.
+    Otherwise, the group does nothing if the mean loss plus or minus two standard errors is within 0.05 nats of 0. In
+    all other cases the verdict is "unclear".
 
     Examples
     --------

@@ -63,14 +63,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
     """Fit a regressor to the difference of y and some columns of X, and predict the sum.
 
     For x = (state, input) and y = next state, the regressor learns the change of the state. The paper calls this
-    RES-VGP and RES-DBNN. The sum has the uncertainty of the change.
+    RES-VGP and RES-DBNN. The standard deviation of the sum is that of the change.
 
     Parameters
     ----------
     regressor : estimator
-        Regressor, of which a clone is fitted to all columns of X. Scale columns and encode angles inside of the
-        regressor, as in ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``. Base columns then stay as
-        they are.
+        Regressor that learns the difference. A clone is fitted to all columns of X. Scale columns and encode angles
+        inside of the regressor, as in ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``. Base columns
+        then stay as they are.
     base : int, str or array-like of shape (n_outputs,), default=None
         Column of X that is subtracted from each output, by its index, or by its name in a data frame. If None, the
         first ``n_outputs`` columns are subtracted.
@@ -183,7 +183,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
             Mean of y at each row.
         std or cov : ndarray
-            Uncertainty as the regressor returns it, if it is asked for.
+            Uncertainty as the regressor returns it, if it is requested.
         """
         check_is_fitted(self)
         X = self._validated(X)

@@ -45,7 +45,7 @@ class Friction(ParametricMap, RobotMap):
     terms : sequence of str, default=("viscous", "coulomb", "stribeck")
         Groups of columns, with one column for each joint.
     stiction_velocity : float or array-like of shape (n_joints,), default=0.01
-        Velocity v_s in rad/s or m/s, above 0. Friction changes its sign smoothly within it.
+        Velocity v_s in rad/s or m/s, above 0. Friction changes its sign smoothly between -v_s and v_s.
     stribeck_velocity : float or array-like of shape (n_joints,), default=0.1
         Velocity v_S in rad/s or m/s, above 0, at which the Stribeck effect has decreased to 37 %.
     sharpness : float or array-like of shape (n_joints,), default=2.0

@@ -63,11 +63,11 @@ class NominalDynamics(ParametricMap, RobotMap):
         Prior standard deviation of the contribution of all other features, in units of the same residual.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`, default=None
         Priors of unknown factors on numbers of the model, such as ``{"mass(elbow)": LogNormal(1.0, 0.2)}``. The
-        regressor learns the factors. If None, the model is used as it is. A joint moves a link, which has these
+        regressor learns the factors. If None, the model is used as it is. A joint and the link that it moves have these
         factors:
 
         - ``"mass(joint)"``: mass and rotational inertia of the link
-        - ``"length(joint)"``: size of the link, which does not change its mass
+        - ``"length(joint)"``: size of the link, with the same mass
         - ``"inertia(joint)"``: rotational inertia of the link about its centre of mass
         - ``"damping(joint)"``: viscous damping of the joint
         - ``"armature(joint)"``: reflected inertia of the rotor

@@ -53,12 +53,13 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         Function in autograd.numpy: ``function(X, **theta)`` -> features of shape (n_samples,), (n_samples, n_h) or
         (n_samples, n_outputs, n_h). X is an array. Each row of the result must depend on its own row of X only.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`
-        Prior of each parameter, in the parameter's own units. All arguments of ``function`` without a default need one.
+        Prior of each parameter, in the parameter's own units. Each argument of ``function`` without a default needs
+        one.
     units : dict of str to str, default=None
         Units of the parameters for `summary`, such as ``{"length": "m"}``.
     derivatives : {"autograd", "differences"}, default="autograd"
         Method for derivatives in θ and x. Use ``"differences"`` if autograd cannot trace ``function``, such as a
-        simulator in C. It needs four more calls per parameter.
+        simulator in C. Differences need four more calls per parameter.
 
     Attributes
     ----------

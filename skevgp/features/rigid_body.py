@@ -44,10 +44,10 @@ class RigidBodyRegressor(ParametricMap):
     robot : str, path-like, System, pinocchio.Model or None, default=None
         Robot, as in `skevgp.datasets.load_robot`. If None, X passes through, and outputs have their own weights.
     friction : sequence of str, default=("viscous", "coulomb", "offset", "armature")
-        Torques of each joint apart from those of its links: a weight times :math:`\dot q`, :math:`\tanh(\dot q / v_s)`,
-        1 and :math:`\ddot q`.
+        Torques of each joint in addition to those of the links. They are a weight times :math:`\dot q`,
+        :math:`\tanh(\dot q / v_s)`, 1 and :math:`\ddot q`, in this order.
     stiction_velocity : float or array-like of shape (n_joints,), default=0.01
-        Velocity v_s in rad/s or m/s, above 0. Coulomb friction changes its sign smoothly within it.
+        Velocity v_s in rad/s or m/s, above 0. Coulomb friction changes its sign smoothly between -v_s and v_s.
     mass_scale : float, default=0.2
         Prior standard deviation of the mass of each link, as a share of the mass.
     com_scale : float, default=0.2
@@ -81,8 +81,8 @@ class RigidBodyRegressor(ParametricMap):
 
     Notes
     -----
-    The size of a link is the largest of three lengths: its radius of gyration, and the distances from its joint to the
-    next joint and to its centre of mass.
+    The size of a link is the largest of three lengths. These are its radius of gyration, and the distances from its
+    joint to the next joint and to its centre of mass.
 
     X has the columns [q, q̇, q̈], such as those of `skevgp.datasets.load_log`. Do not scale them before this map.
 

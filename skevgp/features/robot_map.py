@@ -503,7 +503,7 @@ class RobotMap(RobotTransformer):
         -------
         scale : ndarray of shape (n_outputs, n_features_out)
             Ratio of the map times ``left_over / size``. For a position, ``left_over`` is Δt times that of its velocity,
-            if y has the velocity. It is NaN if `coef_prior` gives the standard deviation.
+            if y has the velocity. The scale is NaN if `coef_prior` gives it.
         """
         layout = self._known_layout()
         left_over = np.asarray(left_over, dtype=float)

@@ -1,1 +1,1 @@
-"""Identification of robots from logs: weights that all joints share, static friction, and payloads."""
+"""Identification of robots from logs: inertial parameters, friction, payloads and contact."""

@@ -1,4 +1,4 @@
-"""ContactMonitor: alarms for contact of a robot, with a limited rate of false alarms."""
+"""ContactMonitor detects contact of a robot, with a limited rate of false alarms."""
 
 from __future__ import annotations
 
@@ -14,50 +14,50 @@ from ..utils.state import StatefulEstimator
 from ..utils.validation import check_real, checked_groups, unchanged_if_it_fails
 from .inverse_dynamics import InverseDynamics
 
-# Durations of the pushes that the filters match, s. Filters see this many of the longest one.
+# Durations of the pushes that the filters match, s. A filter covers this multiple of the longest one.
 _PUSHES, _WINDOWS = (0.05, 0.15, 0.4), 2
-# Alarms within this time are one, s.
+# Alarms within this time count as one, s.
 _APART = 1.0
-# The tail of the statistic is that of the largest share of its maxima, which are at least so many.
+# Share of the maxima of the statistic that its tail is fitted to, and their least number.
 _TAIL, _FEWEST = 0.25, 8
-# Added to the variance of errors, as a share of it.
+# White noise that is added to the variance of errors, as a share of it.
 _WHITE = 1e-3
 
 
 class ContactMonitor(StatefulEstimator):
-    r"""Detect contact by the errors of a robot's torques, with a limited rate of false alarms.
+    r"""Detect contact of a robot from the errors of predicted torques, with a limited rate of false alarms.
 
-    Errors of a model of torques are correlated in time: friction and inertia are wrong for as long as a motion lasts.
-    For each joint and for pushes of 0.05 s, 0.15 s and 0.4 s, the matched filter of these errors,
+    Errors of predicted torques are correlated in time. So matched filters detect pushes s of 0.05 s, 0.15 s and 0.4 s
+    on each joint:
 
     .. math::
 
         g = \frac{s^\top C^{-1} z}{\sqrt{s^\top C^{-1} s}}
 
-    detects a constant push s best, in errors z (in predicted standard deviations) with the covariance C of free motion.
-    There is an alarm when the largest :math:`|g|` is above a threshold. The threshold follows from the tail of its
-    maxima in free motion.
+    Here z are errors in predicted standard deviations, with the covariance C in free motion. A row raises an alarm if
+    the largest :math:`|g|` over joints and pushes exceeds a threshold. The threshold follows from the largest values in
+    free motion.
 
     Parameters
     ----------
     model : InverseDynamics
         Fitted model of the robot. `fit` copies it.
     dt : float, default=0.01
-        Time between rows, s, which is constant.
+        Constant time between rows, s.
     false_alarms_per_hour : float, default=1.0
-        Largest expected number of false alarms in an hour of free motion. Alarms within a second are one.
+        Largest expected number of false alarms in an hour of free motion. Alarms within a second count as one.
 
     Attributes
     ----------
     threshold_ : float
         Rows with a larger statistic raise an alarm.
     scale_ : ndarray of shape (n_joints, 3)
-        Root mean square of each g in free motion.
+        Root mean square of each g in free motion. The statistic is in these units.
     detectable_ : ndarray of shape (n_joints,)
-        Torque of a push of 0.4 s that raises the statistic to the threshold, N m (N): a push twice as large is nearly
-        always found.
+        Torque of a push of 0.4 s that raises the statistic to the threshold, N m (N). A push twice as large is almost
+        always detected.
     hours_ : float
-        Free motion that `fit` has seen, h.
+        Duration of the free motion in `fit`, h.
     model_ : InverseDynamics
         Copy of the model. Fit the monitor again after `InverseDynamics.update` or another fit of the model.
 
@@ -67,9 +67,9 @@ class ContactMonitor(StatefulEstimator):
 
     Notes
     -----
-    Signals must be filtered as those that the model was fitted to. A filter without delay, as in
-    `skevgp.datasets.load_log`, sees the future; a causal filter delays alarms. The first 0.8 s after a gap have no
-    alarms.
+    Filter the signals in the same way as for the fit of the model. A filter without delay, as in
+    `skevgp.datasets.load_log`, uses later rows. A causal filter delays alarms. There are no alarms in the first 0.8 s
+    after a gap.
 
     References
     ----------
@@ -101,27 +101,28 @@ class ContactMonitor(StatefulEstimator):
         self.false_alarms_per_hour = false_alarms_per_hour
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> Self:
-        """Find filters and threshold by free motion that the model was not fitted to.
+        """Find the filters and the threshold from free motion.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, 3 * n_joints)
-            Rows [q, q̇, q̈] without contact, in the order of time: some minutes.
+            Rows [q, q̇, q̈] of some minutes without contact, in the order of time. Use rows that the model was not
+            fitted to.
         y : array-like of shape (n_samples, n_joints)
-            Torques.
+            Torques, in the units of the model.
         pieces : array-like of shape (n_samples,), default=None
-            Labels of rows that follow each other without a gap.
+            Label of the piece of each row. A piece is a part of the log without gaps.
 
         Returns
         -------
         self : ContactMonitor
-            Fitted.
+            The fitted monitor.
 
         Raises
         ------
         ValueError, TypeError
-            If an argument is out of its range, the model is not an `InverseDynamics`, or the rows without the first
-            0.8 s of each piece are fewer than 16 s.
+            If an argument is out of its range, or the model is not an `InverseDynamics`. Also if the log, without the
+            first 0.8 s of each piece, is shorter than 16 s.
         """
         if not isinstance(self.model, InverseDynamics):
             raise TypeError(f"model must be a fitted InverseDynamics; got {type(self.model).__name__}.")
@@ -145,8 +146,8 @@ class ContactMonitor(StatefulEstimator):
         judged = sum(len(one) for one in filtered)
         if judged < 2 * _FEWEST * block:
             raise ValueError(
-                f"fit needs at least {2 * _FEWEST * block} rows of free motion, of which each piece has "
-                f"{self._window} before them; got {judged}."
+                f"fit needs at least {2 * _FEWEST * block} rows of free motion, without the first {self._window} of "
+                f"each piece; got {judged}."
             )
         together = np.concatenate(filtered)
         scale = np.sqrt(np.mean(together**2, axis=0))
@@ -159,7 +160,7 @@ class ContactMonitor(StatefulEstimator):
         self.reset()
 
     def score_samples(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> np.ndarray:
-        """Return the statistic of rows.
+        """Return the statistic of each row.
 
         Parameters
         ----------
@@ -169,8 +170,7 @@ class ContactMonitor(StatefulEstimator):
         Returns
         -------
         statistic : ndarray of shape (n_samples,)
-            Largest absolute g over joints and pushes, in root mean squares of free motion. The first 0.8 s of each
-            piece have 0.
+            Largest absolute value of g / ``scale_`` over joints and pushes. It is 0 in the first 0.8 s of each piece.
         """
         check_is_fitted(self)
         z, _, runs = self._errors(X, y, pieces)
@@ -182,7 +182,7 @@ class ContactMonitor(StatefulEstimator):
         return found
 
     def predict(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> np.ndarray:
-        """Return which rows have an alarm.
+        """Return whether each row raises an alarm.
 
         Parameters
         ----------
@@ -192,12 +192,12 @@ class ContactMonitor(StatefulEstimator):
         Returns
         -------
         alarms : ndarray of bool of shape (n_samples,)
-            Whether the statistic of the row is above the threshold. It uses no later rows.
+            Whether the statistic of the row is above the threshold. The statistic does not depend on later rows.
         """
         return self.score_samples(X, y, pieces=pieces) > self.threshold_
 
     def step(self, x: ArrayLike, y: ArrayLike) -> bool:
-        """Return whether there is an alarm after the next row of a stream.
+        """Add a row to the stream, and return whether it raises an alarm.
 
         Parameters
         ----------
@@ -209,7 +209,7 @@ class ContactMonitor(StatefulEstimator):
         Returns
         -------
         alarm : bool
-            The same as `predict` for all rows since `reset`.
+            Whether the row raises an alarm. `predict` gives the same alarm with all rows since `reset`.
         """
         check_is_fitted(self)
         z, _, _ = self._errors(np.atleast_2d(np.asarray(x)), np.atleast_2d(np.asarray(y)), None)
@@ -226,7 +226,7 @@ class ContactMonitor(StatefulEstimator):
     def _errors(
         self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return errors (n, o) in predicted std, std, and labels (n,) of rows without gaps."""
+        """Return errors (n, o) in predicted std, the std (n, o), and labels (n,) of pieces without gaps."""
         rows, targets = self.model_._new_log(X, y)
         mean, std = self.model_.predict(rows, return_std=True)
         std = std.reshape(targets.shape)
@@ -267,10 +267,10 @@ def _maxima(values: np.ndarray, block: int) -> np.ndarray:
 
 
 def _threshold(maxima: np.ndarray, wanted: float) -> float:
-    """Return the level that this number of maxima of blocks is expected to exceed."""
-    # Excesses over a high level are nearly exponential (Coles 2001, chapter 4). Those of logarithms are taken, a
-    # heavier tail, and their mean plus its standard error: free motion that `fit` has not seen may be of another kind.
-    if wanted >= _TAIL * len(maxima):  # nothing is beyond what was seen
+    """Return the level that the wanted number of maxima is expected to exceed."""
+    # Excesses over a high level are nearly exponential (Coles 2001, chapter 4). Logarithms of the maxima give a heavier
+    # tail, and the mean excess is increased by its standard error, because later free motion may be of another kind.
+    if wanted >= _TAIL * len(maxima):  # the level is within the maxima
         return float(np.quantile(maxima, max(0.0, 1.0 - wanted / len(maxima))))
     count = min(len(maxima) - 1, max(_FEWEST, round(_TAIL * len(maxima))))
     largest = np.sort(np.log(np.maximum(maxima, 1e-300)))[::-1]

@@ -1,4 +1,4 @@
-"""The identified robot: inertias of its links, a model and a URDF file with them, and its payload."""
+"""The identified robot: the inertias of its links, a model and a URDF file with these, and its payload."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _LARGEST_SCALE = 1e6
 def _knows_a_robot(model: IdentifiedRobot) -> bool:
     if not hasattr(model, "feature_map_") or model._has_robot:
         return True
-    raise AttributeError("It needs a robot: give InverseDynamics one.")
+    raise AttributeError("This method needs a robot. Pass robot to InverseDynamics.")
 
 
 class IdentifiedRobot(TorqueRegression):
-    """Methods of `InverseDynamics` on the identified robot."""
+    """Methods of `InverseDynamics` for the identified robot."""
 
     _known: Known
     _joints: list[JointResidual]
@@ -43,21 +43,21 @@ class IdentifiedRobot(TorqueRegression):
 
     @available_if(_knows_a_robot)
     def links(self) -> list[Bunch]:
-        """Return the inertial parameters of each link with their uncertainty.
+        """Return the inertial parameters of each link with their standard deviations.
 
         Returns
         -------
         links : list of Bunch
-            Links from the base to the tip, in the frame of their joints:
+            Links from the base to the tip. Each has these values in the frame of its joint:
 
             - ``joint`` : name of the joint;
-            - ``mass``, ``mass_std`` : kg;
-            - ``com``, ``com_std`` : ndarray of shape (3,), the centre of mass, m;
-            - ``inertia``, ``inertia_std`` : ndarray of shape (6,), moments about the centre of mass: Ixx, Ixy, Iyy,
-              Ixz, Iyz, Izz, kg m²;
+            - ``mass``, ``mass_std`` : mass, kg;
+            - ``com``, ``com_std`` : ndarray of shape (3,), centre of mass, m;
+            - ``inertia``, ``inertia_std`` : ndarray of shape (6,), moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz
+              about the centre of mass, kg m²;
             - ``consistency`` : above 0 if the parameters are physical (`robot_model` takes the nearest physical ones).
 
-            Standard deviations are to first order. Torques depend on combinations of parameters only, so that many
+            Standard deviations are to first order. Torques determine only combinations of the parameters. So many
             standard deviations are those of the prior.
 
         References
@@ -99,13 +99,13 @@ class IdentifiedRobot(TorqueRegression):
 
     @available_if(_knows_a_robot)
     def robot_model(self) -> Any:
-        """Make a model of the identified robot.
+        """Return a Pinocchio model of the identified robot.
 
         Returns
         -------
         model : pinocchio.Model
-            A copy of the robot's model with the most probable physical inertias, armatures, ``damping`` and
-            ``friction``, where negative values are set to 0. It has no offsets, no f_j and no ``gains_``.
+            Copy of the robot's model with the most probable physical inertias, armatures, ``damping`` and
+            ``friction``. Negative damping and friction are set to 0. The copy has no offsets, no f_j and no ``gains_``.
 
         Raises
         ------
@@ -133,19 +133,19 @@ class IdentifiedRobot(TorqueRegression):
 
     @available_if(_knows_a_robot)
     def write_urdf(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the robot's URDF file with the identified parameters, and their standard deviations as comments.
+        """Write the robot's URDF file with the identified parameters, and with standard deviations as comments.
 
         Parameters
         ----------
         target : str or path-like
             File to write.
         overwrite : bool, default=False
-            Whether the target may be the robot's own file.
+            Whether the target may be the file that the robot was loaded from.
 
         Raises
         ------
         ValueError
-            If the robot has no file, its file cannot be rewritten, or has other joints than at `fit`.
+            If the robot has no file, or its file cannot be rewritten, or the file has other joints than in `fit`.
 
         Examples
         --------
@@ -165,7 +165,7 @@ class IdentifiedRobot(TorqueRegression):
         check_is_fitted(self)
         joints = layout_of(self.feature_map_.robot).position_names
         if list(joints) != self._outputs:
-            raise ValueError(f"The robot's file has other joints than when it was fitted: {list(joints)}.")
+            raise ValueError(f"The robot's file must have the joints of the fit, {self._outputs}; got {list(joints)}.")
         parameters, covariance = self._inertial()
         friction, std = self._friction(self.coef_), self._friction(self.coef_std_)
         write_urdf(
@@ -185,18 +185,18 @@ class IdentifiedRobot(TorqueRegression):
         rows, targets = validate_numbers(self, X, y, reset=False, dtype=np.float64)
         targets = np.asarray(targets, dtype=np.float64).reshape(len(rows), -1)
         if targets.shape[1] != len(self._joints):
-            raise ValueError(f"y has {targets.shape[1]} columns; the robot has {len(self._joints)} joints.")
+            raise ValueError(f"y must have {len(self._joints)} columns, one for each joint; got {targets.shape[1]}.")
         check_magnitude(rows, "X")
         check_magnitude(targets, "y")
         return rows, targets
 
     def _inertial(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return means (n_links, 10) and covariance of the links' parameters."""
+        """Return the means (n_links, 10) and the covariance of the inertial parameters of links."""
         size = 10 * len(self._outputs)
         return self.coef_[:size].reshape(-1, 10), self.coef_cov_[:size, :size]
 
     def _friction(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the friction in weights or in their standard deviations, by name and in the model's units."""
+        """Return the friction from weights or their standard deviations, by name, in the units of the model."""
         n_joints = len(self._outputs)
         rest = values[10 * n_joints :].reshape(-1, n_joints) / np.abs(self.gains_)
         return dict(zip(self.feature_map_.friction, rest, strict=True))
@@ -213,12 +213,12 @@ class IdentifiedRobot(TorqueRegression):
         mass_scale: float = 5.0,
         size: float = 0.2,
     ) -> Bunch:
-        """Estimate the payload of the robot from a log with the payload.
+        """Estimate the mass and the inertia of a payload from a log with it.
 
-        All parameters of the robot and the ten parameters of the payload are identified again from both logs. The
-        uncertainty of the robot therefore widens the interval of the payload. Offset, friction and gain of each move
-        differ as much as those of the moves of `fit`. The mean of each f_j is subtracted as if it were known.
-        `InverseDynamics.update` does not count.
+        The ten parameters of the payload and those of the robot are identified together, from both logs. So the
+        uncertainty of the robot widens the interval of the payload. Each move has its own offset, friction and gain,
+        with the variances from `fit`. The mean of each f_j is subtracted as if it were known. The effects from
+        `InverseDynamics.update` are ignored.
 
         Parameters
         ----------
@@ -227,24 +227,26 @@ class IdentifiedRobot(TorqueRegression):
         y : array-like of shape (n_samples, n_joints)
             Torques with the payload, in the units of `fit`.
         groups, pieces : array-like of shape (n_samples,), default=None
-            Labels of trajectories and of pieces without gaps, as in `fit`.
+            Labels of moves and of pieces without gaps, as in `fit`. Without ``groups``, the log is one move.
         link : int, default=-1
-            Index of the link that the payload is fixed to. The default is the last link.
+            Index of the link that carries the payload. The default is the last link.
         mass_scale : float, default=5.0
             Prior standard deviation of the mass of the payload, kg. The prior mean is 0.
         size : float, default=0.2
-            Prior standard deviation of the centre of mass, m: size of the payload plus its distance from the joint's
-            frame.
+            Prior standard deviation of the centre of mass, m. Use the size of the payload plus its distance from the
+            frame of the joint.
 
         Returns
         -------
         payload : Bunch
             Parameters of the payload:
 
-            - ``mass``, ``mass_std``, kg, and ``mass_interval``, the 95 % credible interval;
-            - ``com``, ``com_std`` : ndarray of shape (3,), in the frame of the link's joint, m (to first order; NaN and
-              inf if the mass is not positive);
-            - ``parameters`` (10,), ``covariance`` (10, 10): inertial parameters, as those of a link.
+            - ``mass``, ``mass_std`` : mass, kg;
+            - ``mass_interval`` : tuple of two floats, the 95 % credible interval of the mass, kg;
+            - ``com``, ``com_std`` : ndarray of shape (3,), centre of mass in the frame of the link's joint, m. The
+              standard deviation is to first order. They are NaN and inf if the mass is not positive;
+            - ``parameters``, ``covariance`` : ndarray of shape (10,) and (10, 10), inertial parameters in the order of
+              those of a link.
 
         Raises
         ------
@@ -272,10 +274,10 @@ class IdentifiedRobot(TorqueRegression):
         n_outputs = len(self._joints)
         rows_x, targets = self._new_log(X, y)
         if check_integer(link, "link", minimum=-n_outputs) >= n_outputs:
-            raise ValueError(f"link={link} must be the index of one of the {n_outputs} links.")
+            raise ValueError(f"link={link} must be the index of one of {n_outputs} links.")
         for name, value in (("mass_scale", mass_scale), ("size", size)):
             if check_real(value, name, minimum=0.0, strict=True) > _LARGEST_SCALE:
-                raise ValueError(f"{name} must be no more than {_LARGEST_SCALE:g}; got {value!r}.")
+                raise ValueError(f"{name} must be at most {_LARGEST_SCALE:g}; got {value!r}.")
         rows = self._as_rows(rows_x, targets, groups, pieces)
 
         def missed(torque: np.ndarray) -> np.ndarray:
@@ -297,6 +299,6 @@ class IdentifiedRobot(TorqueRegression):
         return [terms(v, torque, joint.noise.velocity) for joint, v, torque in columns]
 
     def _effects(self, physics: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return z of each joint in standard deviations of the effects of moves, (n, o, 4)."""
+        """Return z of each joint, times the standard deviations of the effects of moves, (n, o, 4)."""
         each = zip(self._joints, self._terms(physics, speed), strict=True)
         return np.stack([z * np.sqrt(np.diag(joint.effects.covariance)) for joint, z in each], axis=1)

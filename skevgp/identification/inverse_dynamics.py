@@ -1,4 +1,4 @@
-"""InverseDynamics: joint torques with credible intervals, and a posterior over masses and friction, from logs."""
+"""InverseDynamics learns joint torques, masses and friction from logs, with credible intervals."""
 
 from __future__ import annotations
 
@@ -34,46 +34,44 @@ from .rows_of_logs import evenly_spread
 from .weaknesses import weaknesses
 from .weights import Fold, Rows, condensed, folds
 
-# Weights that differ from their prior by more prior standard deviations than this make the prior doubtful.
+# If weights differ from their prior by more prior standard deviations than this, `fit` warns about the prior.
 _FAR = 4.0
-# Physics explains hardly anything if its residual has more than this share of the variance of a torque.
+# Physics explains little of a torque if the residual has more than this share of its variance.
 _LITTLE = 0.5
-# Above this share, columns may be in another order, or in degrees.
+# Above this share, `fit` tests whether columns are in another order or in degrees.
 _DOUBTFUL = 0.1
-# Limits of torques. Their variances, and the ratios of these to noise variances, neither vanish nor overflow.
+# Limits of torques. Between them, variances and their ratios to noise variances neither vanish nor overflow.
 _SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
-# Largest speed below which rows count less for f_j. Filters blur the sign of friction above it too, but f_j learns the
-# average friction there.
+# Rows below the speed v_s count less for f_j, and v_s is at most this value. Filters also blur the sign of friction at
+# higher speeds, but there f_j learns the average friction.
 _SHARP = 0.01
 
 
 class InverseDynamics(RegressorMixin, IdentifiedRobot):
-    r"""Joint torques of a robot, its masses and its friction from logs, with their uncertainty.
+    r"""Joint torques, masses and friction of a robot from its logs, with their uncertainty.
 
     .. math::
 
         \tau_j = (1 + c_j) \, Y_j(q, \dot q, \ddot q)\,\pi + F_j(\dot q, \ddot q)\,\varphi + a_j f_j(x_j)
         + z_j^\top d_j + \varepsilon_j
 
-    The weights β = (π, φ) of `RigidBodyRegressor` are common to all joints, and have the robot's model as prior mean.
-    The c are errors of the motors' gains, if these are not known. Each f_j is a sparse Gaussian process
-    (`EVGPRegressor`) of the residual torque of joint j. Its inputs are those of the joint, :math:`x_j = (q_j, \dot q_j,
-    \ddot q_j, \hat\tau_j)`, with the torque :math:`\hat\tau_j` by the weights, because friction of gears depends on
-    load and speed. Moves that were left out decide how much it counts, by the share a_j from 0 to 1. The d_j are
-    offset, friction and gain of a move, which differ from day to day. The noise is larger at low speeds, where the sign
-    of Coulomb friction is not known. See :doc:`/guide/torques`.
+    The weights β = (π, φ) are inertial parameters and friction, with the features of `RigidBodyRegressor`. All joints
+    share them, and their prior mean is the robot's model. The error of a motor gain is c_j. The sparse Gaussian process
+    f_j (`EVGPRegressor`) learns the residual torque from the joint's own signals and load, x_j. Its share in the
+    prediction is a_j, from 0 to 1. The offset, friction and gain of one move are d_j. The noise ε_j is larger at low
+    speeds, where the sign of Coulomb friction is unknown. The user guide explains each term: :doc:`/guide/torques`.
 
     Parameters
     ----------
     robot : RigidBodyRegressor, str, path-like, System, pinocchio.Model or None, default=None
         Approximate model of the robot, such as a URDF with inaccurate masses. Pass a `RigidBodyRegressor` to set
-        friction and prior scales. If None, each output has a linear model and a Gaussian process of all columns.
+        friction and prior scales. If None, each output has its own linear model and a Gaussian process of all columns.
     gain_scale : float, default=0.0
-        Prior standard deviation of the relative error of each joint's gain: for example 0.1 if y are currents times
-        gains of a catalogue, and 0 if y are torques. It mostly affects masses and their intervals.
+        Prior standard deviation of the relative error of each motor gain. For example, use 0.1 if y are currents times
+        gains of a data sheet, and 0 if y are torques. It mostly affects masses and their intervals.
     consistent : bool, default=False
-        Whether to move the weights to the most probable physical ones (masses above 0, positive definite
-        pseudo-inertias). Covariances and noise do not change.
+        Whether to move the weights to the most probable physical ones, with masses above 0 and positive definite
+        pseudo-inertias. Covariances and noise do not change.
     stiction_velocity : "auto" or None, default="auto"
         If ``"auto"``, find the velocity v_s of the mean friction :math:`F \tanh(\dot q / v_s)` of each joint with its
         uncertainty (``theta_``). If None, use that of `RigidBodyRegressor`.
@@ -85,11 +83,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
-        Number of evenly spread rows that each f_j is fitted to. Weights are fitted to all rows.
+        Maximum number of rows for the fit of each f_j, evenly spread over the log. Weights are fitted to all rows.
     max_iter : int or None, default=None
-        Maximum number of iterations, as in `EVGPRegressor`.
+        Maximum number of iterations for each f_j, as in `EVGPRegressor`.
     n_jobs : int or None, default=None
-        Number of joints that are fitted in parallel, in threads; None means 1, -1 all cores.
+        Number of joints to fit in parallel threads. None means 1, and -1 means all cores.
     random_state : int, RandomState instance or None, default=None
         Seed of the inducing points.
 
@@ -100,39 +98,39 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     coef_cov_ : ndarray of shape (n_h, n_h)
         Posterior covariance of β.
     coef_names_ : ndarray of str of shape (n_h,)
-        Names of the weights: m(q1), mcx(q1), ..., viscous(q1), ...
+        Names of the weights, such as m(q1), mcx(q1) and viscous(q1).
     coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
-        Prior means and learned prior standard deviations of β. Torques do not determine a weight whose standard
-        deviation is still that of the prior.
+        Prior means and learned prior standard deviations of β. If ``coef_std_`` is close to the latter, torques do not
+        determine the weight.
     theta_, theta_std_ : dict of str to float
-        Posterior medians of the v_s of mean friction :math:`F \tanh(\dot q / v_s)`, rad/s or m/s, and their standard
-        deviations to first order, such as ``theta_["stiction_velocity(q1)"]``. Empty if they are not found.
+        Posterior medians of the velocities v_s, rad/s or m/s, and their standard deviations to first order. A key is
+        ``"stiction_velocity(q1)"``. They are empty if ``stiction_velocity`` is None, or without Coulomb friction.
     gains_, gains_std_ : ndarray of shape (n_outputs,)
-        Gains 1 + c and their standard deviations. Torques of the model times gains are those of y.
+        Gains 1 + c and their standard deviations. They multiply the torques of rigid bodies.
     noise_variance_ : ndarray of shape (n_outputs,)
-        Noise variance σ² of moving joints.
+        Noise variance σ² of each joint while it moves.
     standing_std_ : ndarray of shape (n_outputs,)
-        Additional standard deviation by friction at rest.
+        Standard deviation of the additional noise at rest, due to Coulomb friction.
     residual_std_ : ndarray of shape (n_outputs,)
-        Prior standard deviation of each a_j f_j, or 0 if there is none.
+        Prior standard deviation of each a_j f_j. It is 0 without f_j.
     residual_models_ : list of EVGPRegressor or None
-        The models f_j, before their means fade. None where left-out moves do not confirm one.
+        Models f_j, before their means fade. An entry is None if held-out moves do not confirm its f_j.
     residual_share_ : ndarray of shape (n_outputs,)
-        The a_j.
+        Shares a_j.
     correlation_time_ : ndarray of shape (n_outputs,)
-        Number of rows that contain as much information on the weights as an independent row.
+        Number of rows with as much information on the weights as one independent row.
     inflation_ : float
-        Factor by which groups differ more from each other than ``correlation_time_`` explains, at least 1. The
-        information of all rows is divided by it.
+        Factor by which groups differ more than ``correlation_time_`` explains, at least 1. The information of all rows
+        is divided by it.
     stiction_velocity_ : ndarray of shape (n_outputs,)
-        Speed below which the sign of friction is not known, rad/s or m/s.
+        Speed below which the sign of friction is unknown and counts as noise, rad/s or m/s.
     move_scale_ : ndarray of shape (n_outputs, 4)
-        Standard deviations between moves: of the offset, of viscous friction, of Coulomb friction and of the relative
-        error of the gain. With few moves they are larger than those that were seen.
+        Standard deviations between moves of the offset, viscous friction, Coulomb friction and relative gain error.
+        With few moves, they are larger than the observed ones.
     move_ : ndarray of shape (n_outputs, 4)
-        These effects in the move that `update` was given, else 0.
+        These four effects in the log of the last `update`, or 0 before it.
     n_iter_ : int
-        Largest number of iterations of an f_j.
+        Largest number of iterations over all f_j.
     feature_map_ : transformer
         Fitted `RigidBodyRegressor`.
     n_features_in_ : int
@@ -148,14 +146,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     Notes
     -----
-    Weights are fitted first by Bayesian regression, together with noise, static friction, its velocities and gains.
-    Filtered rows count less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a
-    training row is predicted from other groups or blocks of rows, so that y is not used twice. Each f_j is at most as
-    large as the residuals, and its length scales are at most three standard deviations of their column and, except that
-    of the speed, at least one. Groups, or blocks of rows if there are fewer than three groups, are left out in turn.
-    Weights and f_j are then fitted again. The a_j has the least error on them; it is 0 unless a t-test at 5 % says that
-    errors fall. Noise and variances of d_j are those of left-out rows. Far from the training rows the mean of f_j
-    fades. Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
+    `fit` first finds the weights, noise, gains and velocities v_s by Bayesian regression. Then it holds out each group
+    in turn, or blocks of rows if there are fewer than three groups. Held-out rows determine the shares a_j, the noise
+    and the variances of d_j. Far from the training rows, the mean of f_j fades to 0. The user guide has the details.
+
+    Memory is a few times 8 bytes times n_samples * n_outputs * n_h.
 
     References
     ----------
@@ -239,14 +234,14 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         X : array-like of shape (n_samples, 3 * n_joints)
             Rows [q, q̇, q̈] in the order of time, in rad, rad/s and rad/s² (m, m/s and m/s² for prismatic joints).
         y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
-            Torques in N m (N), or with ``gain_scale`` currents times gains of a catalogue. Up to 1e40, and the largest
-            of a column must be 0 or above 1e-105.
+            Torques in N m (N), or with ``gain_scale`` currents times gains of a data sheet. They must be at most 1e40.
+            The largest of a column must be 0 or above 1e-105.
         groups : array-like of shape (n_samples,), default=None
-            Labels of the move (trajectory) of each row. Credible intervals for new moves need at least three of them,
-            each with less than four fifths of the rows. Otherwise blocks of rows are used.
+            Label of the move (trajectory) of each row. Credible intervals for new moves need at least three moves, each
+            with less than four fifths of the rows. Otherwise, `fit` holds out blocks of rows.
         pieces : array-like of shape (n_samples,), default=None
-            Labels of rows that follow each other without a gap, such as ``load_log(...).pieces``. If None, the rows of
-            a group have no gaps.
+            Label of the piece of each row, such as ``load_log(...).pieces``. A piece is a part of the log without gaps.
+            If None, each group is a piece.
 
         Returns
         -------
@@ -258,15 +253,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         ImportError
             If Pinocchio is needed and not installed.
         ValueError, TypeError
-            If an argument is out of its range, the data are not finite, shapes do not fit, or X or y is a data frame
-            with the robot's joints in another order.
+            If an argument is out of its range, the data are not finite, or shapes do not fit. Also if X or y is a data
+            frame with the robot's joints in another order.
 
         Warns
         -----
         ConvergenceWarning
             If weights are far from the robot's model, for example because y has other units. If columns seem to be in
             another order, angles in degrees, or positions beyond the limits of the model. If a joint never moves, or
-            has hardly any torque, or rows tell too little about the weights.
+            its torque is far below that of the model. If rows have too little information on the weights.
         RobotModelWarning
             If the model of the robot is unphysical, as in `skevgp.datasets.load_robot`.
         """
@@ -288,7 +283,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_not_vanishing(np.abs(targets).max(axis=0), "y", _SMALLEST_TORQUE)
         self.feature_map_ = self._map().fit(X)  # checks the order of a data frame's columns
         self._check_columns_of_y(y)
-        with ignored(category=RobotModelWarning):  # given already
+        with ignored(category=RobotModelWarning):  # the first fit has warned
             self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)
         self._n_moves = rows.n_moves
@@ -321,12 +316,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             causes = likely_causes(self.feature_map_, X, y, own, is_far=is_far)
         if not is_far and not causes:
             return ""
-        named = "".join(f"{cause}. " for cause in causes) + ("Otherwise, its" if causes else "its")
-        little = f"; of {self._unexplained} hardly anything is explained" if self._unexplained else ""
+        named = "".join(f"{cause[0].upper()}{cause[1:]}. " for cause in causes)
+        little = ""
+        if self._unexplained:
+            little = f" Less than half of the variance of the torques of {self._unexplained} is explained."
         return (
-            f"The robot's model is far from what torques say: {named} masses may be placeholders, "
-            f"or y in other units. Give {'' if self.learn_scales else 'RigidBodyRegressor wider scales, or '}y in N m. "
-            f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations{little}.)"
+            f"The robot's model does not fit the torques. {named}{'Otherwise, its' if causes else 'Its'} masses may be "
+            "placeholders, or y may have other units. "
+            f"Give {'' if self.learn_scales else 'RigidBodyRegressor wider scales, or '}y in N m. The weights are "
+            f"{self._weights.surprise:.1f} prior standard deviations from the model.{little}"
         )
 
     def _check_columns_of_y(self, y: ArrayLike) -> None:
@@ -403,14 +401,14 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         return_std : bool, default=False
             Whether to return the standard deviation too.
         include_noise : bool, default=True
-            Whether standard deviations are those of measured torques, with noise.
+            Whether to include the noise of measured torques in the standard deviation.
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_joints)
             Mean of the torques, in the units of y.
         std : ndarray of the same shape
-            Standard deviation of the torques. Only if ``return_std``.
+            Standard deviation of the torques, returned only if ``return_std=True``.
         """
         check_is_fitted(self)
         rows: np.ndarray = validate_numbers(self, X, reset=False, dtype=np.float64)
@@ -428,7 +426,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     def _moments(
         self, X: np.ndarray, features: np.ndarray, speed: np.ndarray, moves: list[MoveEffects]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean of torques, and the variance by f_j and effects of moves, (n, o) each."""
+        """Return the mean of torques, and the variance due to f_j and effects of moves, (n, o) each."""
         physics = self._weights.predict(features)
         mean, variance = physics.copy(), np.zeros_like(physics)
         for j, (joint, move, z) in enumerate(zip(self._joints, moves, self._terms(physics, speed), strict=True)):
@@ -445,12 +443,14 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         return like_y(values) if self._one_dimensional else values
 
     def update(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> Self:
-        """Adapt to the machine of today by some rows of a new log.
+        """Adapt the predictions to a new log, from its first few seconds.
 
-        Friction changes with temperature, and sensors drift. Each joint has an offset, viscous friction, Coulomb
-        friction and gain of its own in each move, whose variances `fit` finds by left-out moves (``move_scale_``). A
-        few seconds of a new log determine them. Weights and f_j stay. A joint stays as it is if updates by the first
-        third of left-out moves did not lower the errors of the rest.
+        Friction changes with temperature, and sensors drift. So offset, friction and gain of a joint differ between
+        moves. `fit` finds their variances (``move_scale_``), and `update` finds their values in the new log. Weights
+        and f_j do not change.
+
+        `fit` tests updates with the first third of each held-out move. `update` changes a joint only if these updates
+        reduced the errors in the rest of the moves.
 
         Parameters
         ----------
@@ -459,12 +459,12 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
             Torques, in the units of `fit`.
         pieces : array-like of shape (n_samples,), default=None
-            Labels of rows that follow each other without a gap, as in `fit`.
+            Label of the piece of each row, as in `fit`.
 
         Returns
         -------
         self : InverseDynamics
-            The estimator itself. Predictions are those of the move of X. Another call replaces this one.
+            The estimator itself. It now predicts the move of X. The next call replaces the effects of this one.
 
         Raises
         ------
@@ -502,10 +502,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         dt: float = 0.01,
         false_alarms_per_minute: float = 0.01,
     ) -> Bunch:
-        """Test whether a log fits the model, without another load, a fault or contact.
+        """Test whether a log fits the model.
 
-        Errors of the log are compared with errors of left-out moves at `fit`, by their mean square and by the offset,
-        friction and gain that explain them. `update` does not count.
+        A log does not fit if the robot has another load, a fault or contact. The test compares the errors of the log
+        with those of held-out moves in `fit`: their mean square, and the offset, friction and gain that explain them.
+        It ignores `update`.
 
         Parameters
         ----------
@@ -514,15 +515,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         dt : float, default=0.01
             Time between rows, s.
         false_alarms_per_minute : float, default=0.01
-            Expected false alarms per minute of log, for logs without a fault.
+            Expected number of false alarms per minute, for logs without a fault.
 
         Returns
         -------
         check : Bunch
             - ``fits`` : bool, whether the log fits;
-            - ``p_value`` : float, probability that an ordinary log fits as badly or worse;
-            - ``p_values`` : ndarray of shape (n_joints,), the same for each joint alone;
-            - ``joints`` : list of str, joints that do not fit.
+            - ``p_value`` : float, probability of such large errors in a log without a fault;
+            - ``p_values`` : ndarray of shape (n_joints,), the probability for each joint alone;
+            - ``joints`` : list of str, names of the joints that do not fit.
 
         Raises
         ------
@@ -532,7 +533,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
         Notes
         -----
-        With few moves at `fit`, only large faults are found.
+        If `fit` had few moves, the test finds only large faults.
 
         Examples
         --------
@@ -554,11 +555,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     def _errors_of(
         self, X: ArrayLike, y: ArrayLike, pieces: ArrayLike | None, method: str
     ) -> tuple[Rows, np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return the rows of a new log, errors and std (n, o) for a move without training rows, and z of joints."""
+        """Return the rows of a new log, its errors and their std (n, o) as a new move, and z of each joint."""
         check_is_fitted(self)
         if self._n_moves < FEWEST_MOVES:
             raise ValueError(
-                f"{method} compares moves. Fit with at least {FEWEST_MOVES} groups; the number was {self._n_moves}."
+                f"{method} compares moves. Call fit with at least {FEWEST_MOVES} groups; got {self._n_moves}."
             )
         rows_x, targets = self._new_log(X, y)
         rows = self._as_rows(rows_x, targets, None, pieces)

@@ -1,4 +1,4 @@
-"""The residual torque of one joint: a Gaussian process of the joint's own signals, and its noise."""
+"""The residual torque of one joint: a Gaussian process of the joint's own signals, effects of moves, and noise."""
 
 from __future__ import annotations
 
@@ -17,33 +17,34 @@ from .rows_of_logs import evenly_spread
 from .stiction import JointNoise, likeliest_noise, noise_at
 from .weights import Fold, Rows
 
-# Smallest mean square of a residual torque that a kernel is fitted to.
+# A kernel is fitted only if the mean square of the residual torque is larger.
 _NOTHING = 1e-90
 # Limits of the kernel, in standard deviations of residuals and of columns. A signal that is larger than the residuals,
-# or changes within less than the range of positions, is valid for one move only. Friction does change within a fraction
-# of the range of speeds. With length scales beyond the last limit, f would not return to 0 outside the training moves.
+# or that changes within a fraction of the range of positions, fits single moves only. Friction does change within a
+# fraction of the range of speeds. With longer length scales than the last limit, f does not return to 0 outside the
+# training moves.
 _LARGEST_SIGNAL, _SMALLEST_SIGNAL = 1.0, 1e-3
 _SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 3.0
 # Least noise with f, as a share of the noise without f.
 _LEAST = 1e-6
-# Least share of the noise of left-out moves that is not the uncertainty of f.
+# Least share of the variance of held-out errors that is noise and not the uncertainty of f.
 _OWN = 0.05
-# A fit without a move has at most this number of rows and iterations.
+# Limits of rows and iterations of a fit that leaves a move out.
 _ROWS_OF_TRIAL, _ITERATIONS_OF_TRIAL = 500, 20
-# Shares of f that are tried, and the probability that a useless f is kept.
+# Candidates of the share of f, and the level of the t-test: the probability of keeping a useless f.
 _SHARES, _BY_CHANCE = np.linspace(0.0, 1.0, 11), 0.05
 
 
 class QuietRegressor(EVGPRegressor):
-    """A regressor that does not warn about parameters at their bounds, which the user did not set."""
+    """A regressor that does not warn about kernel parameters at their bounds, because these are not the user's."""
 
     def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
         """Do not warn."""
 
     def faded(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean of f, less where it is uncertain, and the variance, (n,) each."""
-        # The mean m is multiplied by 1 - v / s², with the variances v and s² of f after and before data. That is 1 at
-        # training rows and 0 far from them.
+        """Return the faded mean of f and its variance, (n,) each."""
+        # The mean is multiplied by 1 - v / s², where s² and v are the variances of f before and after the data. This
+        # factor is near 1 at training rows and 0 far from them.
         kernel: Any = self.kernel_
         mean, std = self.predict(x, return_std=True, include_noise=False)
         return np.maximum(1.0 - std**2 / kernel.k1.constant_value, 0.0) * mean, std**2
@@ -51,20 +52,20 @@ class QuietRegressor(EVGPRegressor):
 
 @dataclass(frozen=True)
 class JointResidual:
-    """a f(x_j), with a Gaussian process f of a joint's residual torque and a share a; effects of moves; noise."""
+    """A joint's residual torque a f(x_j), with a Gaussian process f and a share a, its effects of moves, and noise."""
 
     model: QuietRegressor | None  # of the joint's own columns; None if physics alone predicts
     noise: JointNoise
     share: float
     effects: MoveEffects  # of a move without training rows
     update: MoveEffects | None  # as in `Variation`
-    move: MoveEffects  # of the move that rows are predicted of
-    # (moves,): log mean squares of the errors of left-out moves, in predicted standard deviations.
+    move: MoveEffects  # of the move to predict
+    # (moves,): logarithms of the mean squares of errors in held-out moves, in predicted standard deviations.
     log_squares: np.ndarray
 
     @property
     def signal(self) -> float:
-        """Prior standard deviation of a f."""
+        """Return the prior standard deviation of a f."""
         if self.model is None:
             return 0.0
         kernel: Any = self.model.kernel_
@@ -74,7 +75,7 @@ class JointResidual:
         return self.moments(x)[0]
 
     def moments(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and variance of a f, (n,) each."""
+        """Return the mean and the variance of a f, (n,) each."""
         if self.model is None:
             return np.zeros(len(x)), np.zeros(len(x))
         mean, variance = self.model.faded(x)
@@ -94,20 +95,21 @@ def fit_joint_residual(
     smooth: np.ndarray,
     **options: Any,
 ) -> JointResidual:
-    """Fit the Gaussian process of a joint to some of the rows x (n, d), and find its share by left-out moves."""
-    # residual (n,) is that of weights of all rows. folds have the torques by weights of other moves, beside the target
-    # (n,). noise is that of the residual without f. Below velocity v_s, the lowest speed at which friction may have a
-    # sign, rows count less for f. If filters blur the sign, the noise is larger up to a higher speed, but there f
-    # learns the average friction. some are the indices that f is fitted to; smooth (d,) are the columns of x with long
-    # length scales; options are those of EVGPRegressor.
+    """Fit the Gaussian process of a joint to some of the rows x (n, d). Held-out moves give its share."""
+    # residual (n,) is the target (n,) minus the torque by the weights of all rows. Each fold has the torques by the
+    # weights of the other moves. noise is that of the residual without f. velocity is v_s: at lower speeds, rows count
+    # less for f, because the sign of friction is unknown. If filters blur the sign, the noise is larger up to a higher
+    # speed than v_s, but there f learns the average friction. some are the indices of the rows that f is fitted to.
+    # smooth (d,) marks the columns of x with long length scales. options are those of EVGPRegressor.
     physics, missed, known = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
     for fold in folds:
         physics[fold.out], known[fold.out] = fold.torques[fold.out], fold.variance
         missed[fold.out] = (target - fold.torques)[fold.out]
 
     def with_moves(model: QuietRegressor | None, share: float, missed: np.ndarray, own: np.ndarray) -> JointResidual:
-        # The variance of errors is that of f, own (n,), of effects of moves, and of noise. That of weights, which few
-        # rows have, counts as noise too: errors of new moves are larger than those of left-out ones.
+        # The variance of errors is the sum of own (n,), the variance of f, of the variance of effects of moves, and of
+        # noise. The variance of weights counts as noise too, because errors of new moves are larger than those of
+        # held-out ones.
         found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
         left = found.variance - float(np.mean(own * found.variance / found.of(speed)))
         floor = _OWN * found.variance if model is not None else noise.variance
@@ -133,7 +135,8 @@ def fit_joint_residual(
     sharp = noise_at(residual, speed, noise.coulomb, velocity, least)
     relative = sharp.of(speed) / sharp.variance
     model = QuietRegressor(kernel=kernel, noise_cv=None, **options)
-    # Each move is predicted by a fit to the others. It starts again: parameters of the last search know the move.
+    # Each move is predicted by a fit to the others. Each fit starts from the same values, because the parameters of the
+    # previous fit have used the move.
     mean, variance = np.empty(len(x)), np.empty(len(x))
     iterations = model.max_iter if model.max_iter is not None else _ITERATIONS_OF_TRIAL
     trial = clone(model).set_params(max_iter=min(iterations, _ITERATIONS_OF_TRIAL))
@@ -150,9 +153,9 @@ def fit_joint_residual(
 
 
 def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, moves: np.ndarray) -> float:
-    """Return the share of f that fits left-out moves best, or 0 if it may be useless."""
-    # Each move counts the same, however large its torques are: the mean over moves of the logarithm of the mean square.
-    # f is kept if a t-test says that the logarithm falls.
+    """Return the share of f with the least error on held-out moves, or 0 if a t-test does not confirm it."""
+    # The criterion is the mean over moves of the logarithm of the mean square error. So each move counts the same,
+    # whatever the size of its torques. f is kept if a t-test confirms that this logarithm falls.
     groups = [moves == move for move in np.unique(moves)]
     squares = np.array([[np.mean((missed - a * mean)[own] ** 2 / relative[own]) for own in groups] for a in _SHARES])
     falls = np.log(np.maximum(squares, 1e-300)) - np.log(np.maximum(squares[0], 1e-300))

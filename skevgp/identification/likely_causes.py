@@ -1,7 +1,7 @@
-"""Likely causes if a robot's model explains torques badly: order of columns, degrees, positions beyond limits.
+"""Likely causes if a robot's model does not fit the torques: order of columns, degrees, positions beyond limits.
 
-Torques of some rows are regressed on the model's features with a wide prior. The regression is repeated with columns in
-another order and with angles in radians. A cause is named if it leaves far less of the torques' variance.
+The torques of some rows are regressed on the model's features with a wide prior. The regression is repeated with
+columns in another order and with angles in radians. A cause is named if this makes the residual far smaller.
 """
 
 from __future__ import annotations
@@ -19,26 +19,28 @@ from ..robots.loading import joint_axes
 from .rows_of_logs import evenly_spread
 
 _ROWS, _ROWS_OF_SEARCH = 400, 200
-# Robots of many joints use fewer rows. With more joints than the last number, only limits of positions are compared.
+# Robots with many joints use fewer rows. With more joints than the last number, only limits of positions are tested.
 _TORQUES, _LEAST_ROWS, _MOST_JOINTS = 4000, 100, 40
-# A cause is named if the residual's share of the variance falls to this share of itself, and by at least the second.
+# A cause is named if the residual's share of the variance falls to the first number times its value, and by at least
+# the second number.
 _FALL, _LEAST_FALL = 0.5, 0.02
-# The prior of a regression is wider than the map's by this factor; noise is at least this share of a variance.
+# The prior of a regression is that of the feature map, wider by the first factor. The noise is at least the second
+# number times the variance of the torque.
 _WIDER, _LEAST_NOISE = 10.0, 1e-4
-# The least share that a search of orders tells from 0.
+# A search of orders counts smaller shares as this one.
 _LEAST_SHARE = 1e-3
-# Up to the first number of joints, all orders are tried. Up to the second, a search exchanges or moves joints step by
-# step. With more joints, the orders by name and backwards are tried.
+# Up to the first number of joints, all orders are tried. Up to the second number, a search exchanges or moves joints
+# step by step, with about the third number of trials. With more joints, only orders by name and backwards are tried.
 _MOST_ALL, _MOST_SEARCHED, _MOST_TRIALS = 6, 12, 1000
-# Positions are beyond limits if they exceed them by this share of the range. They look like degrees if they are larger
-# than a turn, and than the larger limit times the second number.
+# Positions are beyond their limits if they exceed these by the first number times the range. They look like degrees if
+# they exceed a turn, and the second number times the larger limit.
 _BEYOND, _DEGREES = 0.1, 3.0
-# Positions, velocities and accelerations in radians are mostly below it. Smaller signals are not in degrees.
+# Signals below this limit are not in degrees. Most positions, velocities and accelerations in radians are below it.
 _RADIANS = 2.0 * np.pi
 _MOST_NAMED, _MOST_SAID = 8, 3
 _UNITS = (("q",), ("q", "v", "a"), ("q", "v"), ("q", "a"), ("v", "a"), ("v",), ("a",))
 _BLOCKS = {"q": "positions", "v": "velocities", "a": "accelerations"}
-# Limits that differ from a turn by at most this many rad are those of joints that turn freely, and are ignored.
+# If the range differs from a turn by less, rad, the joint turns freely, and its limits are ignored.
 _A_TURN = 0.05
 # Larger limits are ignored.
 _LARGEST_LIMIT = 1e6
@@ -49,8 +51,8 @@ def likely_causes(
     feature_map: Any, X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray], *, is_far: bool
 ) -> list[str]:
     """Return sentences that name likely causes, without a full stop."""
-    # prior is (mean, covariance) of the map's weights. Positions slightly beyond limits are named only if is_far: if
-    # the identified weights are far from the model.
+    # prior is (mean, covariance) of the map's weights. If is_far, the identified weights are far from the model. Only
+    # then are positions slightly beyond their limits named.
     n_joints = y.shape[1]
     said, degrees = _beyond_limits(feature_map.model_, X[:, :n_joints])
     if not is_far:
@@ -62,22 +64,23 @@ def likely_causes(
     trial = _Trial(feature_map, prior, X[some], y[some])
     before, tried = trial.left(trial.X, trial.y), _degrees(trial, degrees)
     best = min(tried, key=lambda one: one.left, default=None)
-    # A scale so small nearly removes signals: degrees are named if that would not explain torques as well.
+    # Radians are degrees times a small factor, which nearly removes the signals. So degrees are named only if torques
+    # are not explained as well without these signals.
     if best is not None and _much_less(best.left, before) and _much_less(best.left, trial.left_without(best)):
         rest = {joint: text for joint, text in said.items() if "q" not in best.blocks or joint not in best.joints}
         return [best.said(trial.names), *_of_limits(rest, degrees), *_order(trial, best.X)]
-    # With columns in another order too, radians alone explain torques no better.
+    # If columns are in another order too, radians alone do not explain torques better. Both are tried together.
     of_positions = [one for one in tried if "q" in one.blocks]
     for one in of_positions if degrees else []:
         if order := _order(trial, one.X):
             return [one.said(trial.names), *order]
-    if not any(one.left <= before for one in of_positions):  # radians make it worse: these are not degrees
+    if not any(one.left <= before for one in of_positions):  # radians increase the residual, so these are not degrees
         said, degrees = said if is_far else {}, []
     return [*_of_limits(said, degrees), *_order(trial, trial.X)]
 
 
 class _Trial:
-    """Some rows of a log, with regressions of their torques."""
+    """Some rows of a log, with regressions of their torques on the model's features."""
 
     def __init__(self, feature_map: Any, prior: tuple[np.ndarray, np.ndarray], X: np.ndarray, y: np.ndarray):
         self.model, self.X, self.y = feature_map.model_, X, y
@@ -89,7 +92,7 @@ class _Trial:
         self._root = _WIDER * vectors * np.sqrt(np.maximum(values, 0.0))
 
     def left(self, X: np.ndarray, y: np.ndarray) -> float:
-        """Return the residual's share of the variance of torques: a mean over joints whose torque varies."""
+        """Return the residual's share of the variance of torques, as a mean over joints whose torque varies."""
         H = self._map.transform(X)
         variance = y.var(axis=0)
         moves = variance > 0.0
@@ -114,8 +117,9 @@ class _Trial:
         return self.left(X, self.y)
 
     def costs(self, X: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return log shares (n_joints, n_columns) of columns of y that model torques with friction do not explain."""
-        # A column that does not vary has the cost 0.
+        """Return the log share of the variance of each column of y that each joint leaves, (joint, column)."""
+        # A column of y is regressed on the joint's torque by the model, its friction and its acceleration. Columns that
+        # do not vary have the cost 0.
         q, v, a = np.split(X, 3, axis=1)
         designs = np.stack([self._body.forces(q, v, a), v, np.sign(v), a], axis=2).swapaxes(0, 1)
         designs -= designs.mean(axis=1, keepdims=True)
@@ -171,7 +175,7 @@ def _listed(said: dict[int, str], joints: list[int]) -> str:
 
 
 class _Degrees(NamedTuple):
-    """Signals that may be in degrees, the rows with these in radians, and the residual's share of torques then."""
+    """Signals that may be in degrees, with the rows X with these in radians, and the residual's share with X."""
 
     blocks: tuple[str, ...]
     joints: list[int]
@@ -198,7 +202,7 @@ def _degrees(trial: _Trial, suspects: list[int]) -> list[_Degrees]:
 
 
 def _order(trial: _Trial, X: np.ndarray) -> list[str]:
-    """Return a sentence on the order of columns, if another order explains torques better."""
+    """Return a sentence on the order of columns, if another order explains torques far better."""
     n = len(trial.names)
     if n == 1:
         return []
@@ -225,7 +229,7 @@ def _order(trial: _Trial, X: np.ndarray) -> list[str]:
 
 
 def _taken(X: np.ndarray, order: Sequence[int]) -> np.ndarray:
-    """Return rows with joint j taken from column order[j] of each block."""
+    """Return rows in which joint j has column order[j] of each block."""
     n = len(order)
     return X[:, [n * block + column for block in range(3) for column in order]]
 
@@ -252,7 +256,7 @@ def _best_order(names: list[str], cost: Callable[[list[int]], float]) -> list[in
 
 
 def _neighbours(order: list[int]) -> Iterator[list[int]]:
-    """Yield the orders with two joints exchanged, or one moved."""
+    """Yield the orders with two joints exchanged or one joint moved."""
     for first, second in combinations(range(len(order)), 2):
         swapped = order.copy()
         swapped[first], swapped[second] = swapped[second], swapped[first]

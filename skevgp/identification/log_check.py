@@ -1,4 +1,4 @@
-"""Does a log fit a model? A test of its errors against those of moves that were left out."""
+"""Test whether a log fits a model: its errors against those of held-out moves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .joint_residual import JointResidual
 from .moves import free_effects
 from .rows_of_logs import correlation_time
 
-# Eigenvalues of a correlation that are rounding errors.
+# Smaller eigenvalues of a correlation matrix are rounding errors.
 _SINGULAR = 1e-10
 
 
@@ -24,12 +24,15 @@ def check_of(
     runs: np.ndarray,
     probability: float,
 ) -> Bunch:
-    """Return whether errors missed (n, o) with predicted std are those of an ordinary move; see `check_log`."""
-    # Two tests for each joint. A t-test compares the logarithm of the mean square with those of left-out moves: errors
-    # that are larger as a whole. And the effects d of the move, which other moves say are N(0, T): with the covariance
-    # C of their estimate, dᵀ (T + C)⁻¹ d / k has an F distribution. That finds shifts smaller than the noise. Variances
-    # between moves are known from few moves of each joint. Relative to the noise all joints are taken as alike: all
-    # count as degrees of freedom, and effects of a joint are at least as large as those of all joints in the mean.
+    """Test whether errors missed (n, o), with their predicted std, are as usual for a new move; see `check_log`."""
+    # There are two tests for each joint. A t-test compares the logarithm of the mean square error with those of
+    # held-out moves. It finds errors that are larger as a whole. The other test is of the effects d of the move, with
+    # the prior N(0, T). If C is the covariance of their estimate, dᵀ (T + C)⁻¹ d / k has an F distribution. This finds
+    # shifts that are smaller than the noise.
+    #
+    # Each joint has few moves, so its variances between moves are uncertain. Relative to the noise, all joints count as
+    # alike: they share the degrees of freedom, and the variances of effects of a joint are at least the mean over
+    # joints.
     judged = [j for j, joint in enumerate(joints) if len(joint.log_squares) > 1]
     logs = np.array([joints[j].log_squares for j in judged]).reshape(len(judged), -1)
     n_moves = logs.shape[1] if judged else 1
@@ -42,7 +45,7 @@ def check_of(
     p_values = np.ones(len(joints))
     for j, of_joint in zip(judged, logs, strict=True):
         squares = (missed[:, j] / std[:, j]) ** 2
-        # To first order, the logarithm of the mean of n squares has this variance.
+        # This is the variance of the logarithm of the mean of n squares, to first order.
         mean = max(float(squares.mean()), 1e-300)
         sampling = squares.var() / mean**2 * correlation_time(squares - mean, runs) / len(squares)
         error = np.sqrt(spread * (1.0 + 1.0 / n_moves) + sampling)
@@ -56,7 +59,7 @@ def check_of(
 def _shifted(
     variance: np.ndarray, z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray, dof: int
 ) -> float:
-    """Return the probability of effects at least as large, in a move without training rows."""
+    """Return the probability that the effects of a new move without a fault are at least as large."""
     d, covariance = free_effects(z, missed, std, runs)
     covariance = covariance + np.diag(variance)
     scale = np.sqrt(np.diag(covariance))

@@ -1,4 +1,4 @@
-"""How the torques of one joint differ from move to move: offset, friction and gain of a move."""
+"""Effects of a move on the torque of a joint: offset, viscous friction, Coulomb friction and gain."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from .weights import Rows
 
 # Names of the effects of a move on a joint's torque, the columns of `terms`.
 EFFECTS = ("offset", "viscous", "coulomb", "gain")
-# Fewer moves do not tell how moves differ.
+# Least number of moves to find out how moves differ.
 FEWEST_MOVES = 3
 # Steps of expectation maximisation.
 _STEPS = 50
-# Shares of the variances that an update may use, and the part of a move that decides on them.
+# Shares of the variances that an update may use, and the part of a move that tests of updates use.
 _SHARES, _FIRST = (0.0, 0.01, 0.1, 1.0), 1.0 / 3.0
 
 
 class MoveEffects(NamedTuple):
-    """Effects d ~ N(mean, covariance) of a move on a joint's torque, z(x)ᵀ d with z = (1, q̇, tanh(q̇ / v_s), τ̂)."""
+    """Effects d ~ N(mean, covariance) of a move: they add z(x)ᵀ d to a torque, with z = (1, q̇, tanh(q̇ / v_s), τ̂)."""
 
     mean: np.ndarray  # (4,)
     covariance: np.ndarray  # (4, 4)
@@ -32,32 +32,32 @@ class MoveEffects(NamedTuple):
         return cls(np.zeros(len(EFFECTS)), np.zeros((len(EFFECTS), len(EFFECTS))))
 
     def moments(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and variance of the effects on rows with terms z (n, 4), (n,) each."""
+        """Return the mean and the variance of zᵀ d for rows z (n, 4), (n,) each."""
         return z @ self.mean, np.einsum("ni,ij,nj->n", z, self.covariance, z) + self.extra
 
 
 class Variation(NamedTuple):
-    """How moves differ."""
+    """Differences between the moves of a joint, and the noise within moves."""
 
     effects: MoveEffects  # of a move without training rows
-    update: MoveEffects | None  # the prior of effects that rows of a move update, or None if these do not help
-    noise: JointNoise  # that is left within moves
+    update: MoveEffects | None  # the prior of effects in an update, or None if updates do not help
+    noise: JointNoise  # within moves
 
 
 def terms(speed: np.ndarray, torque: np.ndarray, velocity: float) -> np.ndarray:
-    """Return z(x) of rows, (n, 4), from speed and torque by the weights, (n,) each."""
+    """Return z(x) of rows, (n, 4), from their speed and the torque τ̂ that the weights predict, (n,) each."""
     return np.column_stack([np.ones_like(speed), speed, np.tanh(speed / velocity), torque])
 
 
 def variation(
     z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, known: np.ndarray, rows: Rows
 ) -> Variation:
-    """Find how moves differ, and the noise that is left, from errors (n,) of predictions by other moves."""
-    # known (n,) is the variance of the predictions. noise is that of the errors beside it.
+    """Estimate differences between moves, and the noise within moves, from errors missed (n,) on held-out moves."""
+    # The variance of errors is the sum of `known` (n,), the variance of the predictions, and of the noise.
     #
     # Each move has its own effects d ~ N(0, diag(t)), as in a linear model with random effects. Expectation
-    # maximisation finds the most likely t. Rows count less if errors are correlated in time, so that slow errors within
-    # a move are not taken for effects.
+    # maximisation finds the most likely t. Rows count less if errors are correlated in time. So slow errors within a
+    # move do not count as effects.
     std, moves = np.sqrt(noise.of(speed) + known), [rows.groups == move for move in np.unique(rows.groups)]
     within = np.empty_like(missed)
     for own in moves:
@@ -70,15 +70,15 @@ def variation(
     for _ in range(_STEPS):
         found = [_posterior(variance, *information) for information in informations]
         variance = np.mean([d**2 + np.diag(covariance) for d, covariance in found], axis=0)
-    # Together effects and noise are as large as the errors of left-out moves.
+    # Effects and noise together are as large as the errors on held-out moves.
     between = float(np.mean(z**2 @ variance / noise.of(speed)))
     inside = max(1.0 - between, share)
-    # Blocks of one or two moves differ less than moves do.
+    # Blocks of one or two moves differ less than whole moves do.
     factor = (1.0 + 0.5 / rows.n_moves if rows.n_moves < FEWEST_MOVES else 1.0) / max(1.0, between + inside)
     left = noise._replace(variance=factor * inside * noise.variance)
     effects = MoveEffects(np.zeros(len(variance)), factor * np.diag(variance))
     update = _update(effects, z, missed, speed, left, known, rows, moves) if rows.n_moves >= FEWEST_MOVES else None
-    # Few moves say little about variances: those of a new move are larger by as much as for Student's t distribution.
+    # With few moves, variances are uncertain. As in Student's t distribution, the variances of a new move are larger.
     wider = effects._replace(covariance=(1.0 + 2.0 / rows.n_moves) * effects.covariance)
     return Variation(wider, update, left)
 
@@ -93,9 +93,9 @@ def _update(
     rows: Rows,
     moves: list[np.ndarray],
 ) -> MoveEffects | None:
-    """Return the prior of effects that the first rows of moves update best, by the errors of the others."""
-    # As in `joint_residual`, moves decide, each of which counts the same: errors of the rest of a move must fall, and
-    # noise grows by what they are larger than they should be.
+    """Return the prior of effects with the best updates: from the first rows of moves, they predict the others."""
+    # As in `joint_residual`, each move counts the same. The errors of the rest of a move must fall. If they are larger
+    # than predicted, extra noise makes up the difference.
     falls, sizes = np.zeros((len(_SHARES), len(moves))), np.ones((len(_SHARES), len(moves)))
     for k, own in enumerate(moves):
         chosen = np.flatnonzero(own)
@@ -119,13 +119,13 @@ def _update(
 def of_move(
     before: MoveEffects, z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, runs: np.ndarray
 ) -> MoveEffects:
-    """Return the effects of a move after some of its rows, whose errors without effects are missed (n,)."""
+    """Return the posterior of the effects of a move, given errors missed (n,) of predictions without effects."""
     information = _of_correlated(z, missed, np.sqrt(noise.of(speed)), runs)
     return MoveEffects(*_posterior(np.diag(before.covariance), *information), before.extra)
 
 
 def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the effects of a move by least squares, and their covariance."""
+    """Return the least-squares estimate of the effects of a move, and its covariance."""
     information, score = _of_correlated(z, missed, std, runs)
     size = np.sqrt(np.diag(information))
     unit = np.where(size > 0.0, size, 1.0)
@@ -136,7 +136,7 @@ def free_effects(z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.nd
 def _of_correlated(
     z: np.ndarray, missed: np.ndarray, std: np.ndarray, runs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ZᵀZ and Zᵀe of the rows of a move. Rows count less if the errors that effects leave are correlated."""
+    """Return ZᵀZ and Zᵀe of the rows of a move. Rows count less if errors without effects are correlated."""
     left = _without_effects(z / std[:, np.newaxis], missed / std)
     return _information(z, missed, std * np.sqrt(correlation_time(left, runs)))
 
@@ -148,7 +148,7 @@ def _information(z: np.ndarray, missed: np.ndarray, scale: np.ndarray) -> tuple[
 
 
 def _without_effects(z: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return the errors of a move, in standard deviations, without its effects, found by least squares."""
+    """Return the errors of a move, in standard deviations, minus its effects by least squares."""
     size = np.sqrt(np.sum(z**2, axis=0))
     unit = z / np.where(size > 0.0, size, 1.0)
     left: np.ndarray = errors - unit @ np.linalg.lstsq(unit, errors, rcond=1e-8)[0]
@@ -156,8 +156,8 @@ def _without_effects(z: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 
 def _posterior(variance: np.ndarray, information: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of d ~ N(0, diag(variance)) given rows with information ZᵀZ and score Zᵀe."""
-    # With d = √t u the precision of u is I + √t ZᵀZ √t, which no t makes singular.
+    """Return the posterior mean and covariance of d ~ N(0, diag(variance)), given ZᵀZ and Zᵀe of rows."""
+    # With d = √t u, the precision of u is I + √t ZᵀZ √t. It is never singular, even for t = 0.
     root = np.sqrt(variance)
     precision = np.eye(len(root)) + root[:, np.newaxis] * information * root
     covariance = root[:, np.newaxis] * np.linalg.inv(precision) * root

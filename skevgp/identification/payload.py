@@ -1,4 +1,4 @@
-"""The payload of a robot, from torques with it and a model without it."""
+"""The payload of a robot, from a log with it and a model without it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _95 = 1.959963984540054
 
 
 def payload_prior(prior: Prior, n_effects: int, mass_scale: float, size: float) -> Prior:
-    """Add effects of moves, and a body with ten nearly unknown parameters, to the prior of a robot."""
+    """Add effects of moves, and a body with ten parameters with a wide prior, to the prior of a robot."""
     # The mass has mean 0 and standard deviation mass_scale (kg). First moments have size (m) times that, and moments of
     # inertia size² times that.
     body = mass_scale * np.concatenate([[1.0], np.full(3, size), np.full(6, size**2)])
@@ -32,12 +32,12 @@ def find_payload(
     effects: Callable[[np.ndarray], np.ndarray],
     rounds: int = 2,
 ) -> Bunch:
-    """Identify the body on a link (from 0) from rows with the payload, given rows without it as ``known``."""
-    # Weights and gains are identified again from both logs, because each log determines their product only. residual
-    # returns the Gaussian processes' part of torques (n, o) of the model, and effects the columns (n, o, k) of effects
-    # of a move, given torques without these effects. They depend on the load, and the load depends on them, so that
-    # there are several rounds, from the torque (n, o) without the load. Each move and output has its own effects, with
-    # weights N(0, I).
+    """Identify the payload on a link (from 0) from rows with it, given the condensed rows without it, known."""
+    # Weights and gains are identified again from both logs, because each log determines only their product. Given a
+    # torque without effects of moves, residual returns the part of the Gaussian processes in it (n, o), and effects the
+    # columns (n, o, k) of a move's effects. Both depend on the load, and the estimate of the load depends on them. So
+    # there are several rounds, which start with the torque (n, o) without the load. Each move and output has its own
+    # effects, with weights N(0, I).
     body = rows.features[:, :, 10 * link : 10 * link + 10]
     moves, (n, n_outputs, _) = [rows.groups == move for move in np.unique(rows.groups)], rows.features.shape
 

@@ -1,4 +1,4 @@
-"""Information of the rows of a log, which follow each other and were filtered."""
+"""Correlated rows of a log: how much information they have, and which are held out together."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ _LARGEST_SHARE, _BLOCKS = 0.8, 5
 
 
 def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:
-    """Return the number of rows, from 1 to n, with as much information as an independent row."""
-    # 1 + 2 Σ ρ_k, with the autocorrelations ρ_k of the errors (n,) in the order of time, up to the first pair of
-    # neighbouring lags whose sum is not positive (Geyer 1992, "Practical Markov chain Monte Carlo", initial positive
-    # sequence). No products are taken across runs (n,).
+    """Return the number of rows, from 1 to n, with as much information as one independent row."""
+    # This is 1 + 2 Σ ρ_k with the autocorrelations ρ_k of the errors (n,) in the order of time. The sum ends at the
+    # first pair of neighbouring lags whose sum is not positive (Geyer 1992, "Practical Markov chain Monte Carlo",
+    # initial positive sequence). Rows of different runs (n,) do not count as neighbours.
     total = np.zeros(0)
     for run in np.unique(runs):
         part = errors[runs == run]
@@ -30,14 +30,14 @@ def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:
 
 
 def evenly_spread(n_rows: int, most: int) -> np.ndarray:
-    """Return the indices of at most so many rows."""
+    """Return the indices of evenly spread rows, at most the given number."""
     return np.unique(np.linspace(0, n_rows - 1, min(n_rows, most)).astype(int))
 
 
 def blocks_of(groups: np.ndarray | None, n_rows: int) -> np.ndarray:
-    """Return labels (n,) from 0 of rows that are left out together: whole groups, or blocks of successive rows."""
-    # Blocks are used if there are fewer than three groups, or one has half of the rows or more. If there are more
-    # groups than blocks, groups are joined, the largest with the smallest.
+    """Return labels (n,) from 0 of rows that are held out together: whole groups, or blocks of successive rows."""
+    # Blocks are used if there are fewer than three groups, or if one group has _LARGEST_SHARE of the rows or more. If
+    # there are more groups than _BLOCKS, groups are joined to blocks of similar size.
     labels = np.zeros(n_rows, dtype=int) if groups is None else np.unique(groups, return_inverse=True)[1].ravel()
     sizes = np.bincount(labels)
     if len(sizes) > 2 and sizes.max() < _LARGEST_SHARE * n_rows:
@@ -50,14 +50,14 @@ def blocks_of(groups: np.ndarray | None, n_rows: int) -> np.ndarray:
 
 
 def groups_of(groups: np.ndarray | None, blocks: np.ndarray) -> np.ndarray:
-    """Return labels (n,) of rows that may differ as a whole: the groups if there are several, else blocks."""
+    """Return labels (n,) of sets of rows that may differ as a whole: the groups if there are several, else blocks."""
     if groups is None or len(np.unique(groups)) < 2:
         return blocks
     return np.unique(groups, return_inverse=True)[1].ravel()
 
 
 def _joined(sizes: np.ndarray) -> np.ndarray:
-    """Assign groups, from the largest on, to the block with the fewest rows."""
+    """Return the block of each group. From the largest on, a group joins the block with the fewest rows."""
     blocks, rows = np.zeros(len(sizes), dtype=int), np.zeros(_BLOCKS)
     for group in np.argsort(-sizes, kind="stable"):
         blocks[group] = np.argmin(rows)

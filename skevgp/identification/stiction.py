@@ -1,4 +1,4 @@
-"""Friction of a joint at low speed: noise, because Coulomb friction has no known sign there, and the mean."""
+"""Coulomb friction of a joint at low speed: noise, because its sign is unknown there, and its mean."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from ..features import LogNormal
 
-# A joint moves if less than this share of the variance of friction at rest remains.
+# A joint counts as moving if less than this share of the variance of friction at rest remains.
 _MOVING = 0.1
 # Limits of the speed v_s above which friction has a sign, rad/s or m/s.
 _SLOWEST, _FASTEST = 1e-3, 0.3
@@ -18,15 +18,15 @@ VELOCITY_PRIOR = LogNormal(0.015, 0.7)
 
 
 def undecided(speed: np.ndarray, velocity: np.ndarray | float) -> np.ndarray:
-    """Return 1 - tanh²(q̇ / v_s), the share of the variance of static friction that remains, (n,) or (n, o)."""
+    """Return 1 - tanh²(q̇ / v_s), the share of the variance of friction at rest that remains, (n,) or (n, o)."""
     return 1.0 - np.tanh(speed / velocity) ** 2
 
 
 class JointNoise(NamedTuple):
-    """The variance of a joint's torque, σ² + F²/3 (1 - tanh²(q̇ / v_s))."""
+    """Noise of a joint's torque, with the variance σ² + F²/3 (1 - tanh²(q̇ / v_s))."""
 
-    # At rest friction is between -F and F, with variance F²/3 if nothing else is known. At a speed where its mean is
-    # F tanh(q̇ / v_s), the rest of F² is random.
+    # At rest, friction is uniform between -F and F, with the variance F²/3. At higher speeds its mean is
+    # F tanh(q̇ / v_s), and the share 1 - tanh²(q̇ / v_s) of the variance remains.
     variance: float  # σ²
     coulomb: float  # F, or 0 without Coulomb friction
     velocity: float  # v_s
@@ -36,12 +36,12 @@ class JointNoise(NamedTuple):
         return self.variance + self.standing(speed)
 
     def standing(self, speed: np.ndarray) -> np.ndarray:
-        """Return the part of the variance by friction."""
+        """Return the variance due to friction of unknown sign."""
         return self.coulomb**2 / 3.0 * undecided(speed, self.velocity)
 
 
 def noise_at(errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, least: float) -> JointNoise:
-    """Find the most likely σ², at least ``least``, of Gaussian errors (n,) with the other noise known."""
+    """Find the most likely σ², at least ``least``, of Gaussian errors (n,), given F and v_s."""
     standing = coulomb**2 / 3.0 * undecided(speed, velocity)
     most = _most(errors, least)
 
@@ -61,8 +61,9 @@ def likeliest_noise(
     least: float,
     start: JointNoise | None = None,
 ) -> JointNoise:
-    """Find the most likely σ² and v_s, which depends on the filters of the signals."""
-    # v_s starts at velocity. With a start, the noise of nearly the same errors, it is the only one.
+    """Find the most likely σ² and v_s, given F. The v_s depends on the filters of the signals."""
+    # The search of v_s starts at velocity and above it. If start is given, the noise of similar errors, it is the only
+    # starting point.
     if coulomb == 0.0:
         return noise_at(errors, speed, coulomb, velocity, least)
     squares, largest, most = errors**2, coulomb**2 / 3.0, _most(errors, least)
@@ -98,7 +99,7 @@ def _most(errors: np.ndarray, least: float) -> float:
 
 
 class MeanFriction(NamedTuple):
-    """Mean friction F tanh(q̇ / v_s) of joints, to first order in the coordinates of v_s (`features.theta.Prior`)."""
+    """Mean friction F tanh(q̇ / v_s) of joints, linearised in the coordinates z of v_s (`features.theta.Prior`)."""
 
     coulomb: np.ndarray  # (o,), F
     z: np.ndarray  # (o,), the coordinates where it is linearised
@@ -109,7 +110,7 @@ class MeanFriction(NamedTuple):
         return np.array([VELOCITY_PRIOR.value(z) for z in self.z])
 
     def on(self, features: np.ndarray, speed: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return features (n, o, p) with these v_s, given their columns (o,) of Coulomb friction."""
+        """Return features (n, o, p) with these v_s, given the columns (o,) of Coulomb friction."""
         changed = features.copy()
         changed[:, range(len(self.z)), columns] = np.tanh(speed / self.velocity)
         return changed

@@ -1,4 +1,4 @@
-"""The regression of torques: rows of logs, features, the prior of weights, and velocities of friction."""
+"""The regression of torques: rows of logs, features, the prior of the weights, and the velocities of friction."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from .rows_of_logs import blocks_of, groups_of
 from .stiction import VELOCITY_PRIOR, MeanFriction
 from .weights import Prior, Rows, Weights, identify, with_gains, with_others
 
-# Steps of the velocities of friction end if they are shorter than this share of a posterior standard deviation, or
-# after so many. The longest step, in prior standard deviations.
+# The search of v_s ends if all steps are shorter than the first number, in posterior standard deviations, or after the
+# second number of steps. The third number is the longest step, in prior standard deviations.
 _SETTLED, _VELOCITY_STEPS, _LONGEST = 0.1, 6, 1.0
 
 
 class TorqueRegression(StatefulEstimator):
-    """Base of `InverseDynamics` that turns its rows into those of a regression, and finds the weights."""
+    """Base of `InverseDynamics` that makes the rows of a regression and finds the weights."""
 
     robot: Any
     gain_scale: float
@@ -34,7 +34,7 @@ class TorqueRegression(StatefulEstimator):
     learn_scales: bool
     feature_map_: Any
     _weights: Weights
-    # Where the columns after the weights are derivatives of friction, and the posterior of its parameters.
+    # The point where mean friction is linearised, and the posterior of the v_s. None if v_s is not learned.
     _friction_at: MeanFriction | None = None
     _theta: ThetaPosterior | None = None
 
@@ -59,7 +59,7 @@ class TorqueRegression(StatefulEstimator):
         return X[:, n_outputs : 2 * n_outputs] if self._has_robot else np.zeros((len(X), n_outputs))
 
     def _features(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
-        """Return H (n, o, p); without a robot, each output has its own weights and a constant."""
+        """Return H (n, o, p). Without a robot, each output has its own weights and a constant."""
         H = self.feature_map_.transform(X)
         if H.ndim == 3:
             if self._friction_at is None:
@@ -87,7 +87,7 @@ class TorqueRegression(StatefulEstimator):
         return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
 
     def _find_weights(self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None) -> Rows:
-        """Find the weights and the velocities v_s of mean friction; returns the rows."""
+        """Find the weights and the velocities v_s of mean friction, and return the rows."""
         self._friction_at = self._theta = None
         rows = self._as_rows(X, y, groups, pieces)
         prior = self._prior(rows)
@@ -95,8 +95,8 @@ class TorqueRegression(StatefulEstimator):
         if self.stiction_velocity is None or coulomb is None:
             self._weights = identify(rows, prior)
             return rows
-        # Gauss-Newton: the derivatives of friction in the coordinates of v_s join the features. Their weights are the
-        # step to the mode, with the posterior covariance of the coordinates there.
+        # Gauss-Newton: the derivatives of friction in the coordinates z of v_s are added to the features. Their weights
+        # are the step to the mode, and the covariance of the weights is the posterior covariance of z there.
         n_outputs = y.shape[1]
         friction = MeanFriction(np.zeros(n_outputs), np.zeros(n_outputs))
         features = friction.on(rows.features, rows.speed, coulomb)
@@ -116,12 +116,12 @@ class TorqueRegression(StatefulEstimator):
             step, std = weights.mean[own], np.sqrt(np.diag(weights.covariance)[own])
             if (np.abs(step) < _SETTLED * std).all():
                 break
-            # Steps that turn around are too long.
+            # A step against the last one means that the last one was too long.
             damping = np.where(direction * step < 0.0, 0.5 * damping, damping)
             direction, z = step, z + damping * np.clip(step, -_LONGEST, _LONGEST)
         self._weights, self._friction_at = weights, friction
         self._theta = self._velocities(friction.z + step, weights.covariance[own, own])
-        with ignored(category=RobotModelWarning):  # given already
+        with ignored(category=RobotModelWarning):  # the first fit of the map has warned
             self.feature_map_.set_params(stiction_velocity=friction.velocity).fit(X)
         return linear
 
@@ -138,14 +138,14 @@ class TorqueRegression(StatefulEstimator):
         if isinstance(self.robot, RigidBodyRegressor):
             if self.robot.parameters:
                 raise ValueError(
-                    f'{type(self).__name__} finds stiction velocities itself, by stiction_velocity="auto": leave the '
+                    f'{type(self).__name__} finds stiction velocities itself, with stiction_velocity="auto". Leave '
                     f"parameters of RigidBodyRegressor at None; got {list(self.robot.parameters)}."
                 )
             return clone(self.robot)
         return RigidBodyRegressor(self.robot)
 
     def _prior(self, rows: Rows) -> Prior:
-        """Return the prior of the weights, that of the map or a wide one, and of gains."""
+        """Return the prior of the weights and gains. That of the weights is the feature map's, or a wide one."""
         features, y = rows.features, rows.targets
         n_outputs = y.shape[1]
         names = [str(name) for name in self._names(n_outputs)]

@@ -7,24 +7,24 @@ import numpy as np
 from .rows_of_logs import correlation_time
 from .weights import Rows, Weights
 
-# A joint whose torque is below this share of what the robot's model needs is not driven.
+# A joint counts as not driven if its torque is below this share of the torque of the robot's model.
 _NOT_DRIVEN = 0.1
-# A joint that is never faster is at rest, rad/s or m/s.
+# A joint counts as at rest if its speed is always lower, rad/s or m/s.
 _REST = 0.01
-# Least number of independent rows for each combination of weights that they determine.
+# Least number of independent rows for each combination of weights that the rows determine.
 _ROWS_PER_WEIGHT = 3.0
 
 
 def weaknesses(rows: Rows, weights: Weights, n_coef: int, names: list[str]) -> list[str]:
-    """Return sentences on what the rows of a robot do not tell. The first n_coef weights are those of its model."""
+    """Return warnings about too little information in the rows. The first n_coef weights are those of the model."""
     said = []
     prior = weights.prior
     fastest = np.abs(rows.speed).max(axis=0)
     still = fastest < _REST
     if still.any():
         said.append(
-            f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s), so that nothing is "
-            "learned of their friction and inertia. Record motion of all joints."
+            f"{_of(names, still)} never move faster than {fastest[still].max():.2g} rad/s (m/s). So their friction "
+            "and inertia cannot be estimated. Record motion of all joints."
         )
     needed = np.sqrt(np.mean((rows.features[:, :, :n_coef] @ prior.mean[:n_coef]) ** 2, axis=0))
     torque = np.sqrt(np.mean(rows.targets**2, axis=0))
@@ -32,17 +32,17 @@ def weaknesses(rows: Rows, weights: Weights, n_coef: int, names: list[str]) -> l
     if idle.any():
         share = 100.0 * (torque[idle] / needed[idle]).max()
         said.append(
-            f"Torques of {_of(names, idle)} are at most {share:.1f} % of what the robot's model needs for this motion. "
-            "Either their motors were off, and the model will be wrong where they are on, or y has another unit, or "
-            "the masses of the robot's model are far too large."
+            f"Torques of {_of(names, idle)} are at most {share:.1f} % of those of the robot's model for this motion. "
+            "If the motors were off, predictions will be wrong when they are on. Otherwise, y may have another unit, "
+            "or the masses of the robot's model may be far too large."
         )
     errors = rows.targets - weights.predict(rows.features)
-    for move in np.unique(rows.groups) if rows.n_moves > 1 else []:  # its offset says nothing of the rows inside
+    for move in np.unique(rows.groups) if rows.n_moves > 1 else []:  # an offset is not a correlation
         errors[rows.groups == move] -= errors[rows.groups == move].mean(axis=0)
     worth = sum(len(errors) / correlation_time(column, rows.runs) for column in errors.T)
     if worth < _ROWS_PER_WEIGHT * weights.determined:
         said.append(
-            f"Rows that follow each other are correlated: {rows.targets.size} torques tell as much as {worth:.0f} "
+            f"Successive rows are correlated. {rows.targets.size} torques have as much information as {worth:.0f} "
             f"independent ones, for {weights.determined:.0f} combinations of weights. Record more motion."
         )
     return said

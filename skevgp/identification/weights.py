@@ -1,4 +1,4 @@
-"""Bayesian regression of all outputs on common weights, with the gains and the noise of each output."""
+"""Bayesian regression of all outputs on shared weights, with the gain and the noise of each output."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..fitting.prior import root_of_correlation
 from .rows_of_logs import correlation_time
 from .stiction import JointNoise, likeliest_noise
 
-# Maximum numbers of rounds for noise, its correlation and gains, and the relative change at which they have settled.
+# Maximum numbers of rounds for noise, its correlation and gains. The rounds end at the last number, a relative change.
 _TRIAL_ROUNDS, _ROUNDS, _SETTLED = 4, 12, 0.02
-# Starts of the noise, as shares of an output's variance.
+# Starting values of the noise, as shares of an output's variance.
 _FIRST_NOISE = (1.0, 1e-5)
 # Smaller eigenvalues of a precision with unit diagonal are rounding errors.
 _SINGULAR = 1e-15
@@ -33,8 +33,8 @@ class Rows:
     targets: np.ndarray  # (n, o)
     speed: np.ndarray  # (n, o), for the noise of friction at rest (`JointNoise`)
     runs: np.ndarray  # (n,) labels of rows that follow each other without a gap
-    groups: np.ndarray  # (n,) labels of rows that may differ from others as a whole
-    blocks: np.ndarray  # (n,) labels of rows that are left out together
+    groups: np.ndarray  # (n,) labels of sets of rows that may differ as a whole
+    blocks: np.ndarray  # (n,) labels of rows that are held out together
     n_moves: int = 1  # number of trajectories that the user named
 
     def __getitem__(self, chosen: np.ndarray) -> Rows:
@@ -44,11 +44,11 @@ class Rows:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of the weights, and of the gains after them if these are unknown."""
+    """Prior of the weights, followed by that of the gains if they are unknown."""
 
     mean: np.ndarray  # (P,), with P = p, or p + o with gains
     covariance: np.ndarray  # (P, P)
-    scaled: np.ndarray  # (p,) weights that gains multiply; friction is in the units of the measurement
+    scaled: np.ndarray  # (p,) whether gains multiply the weight. They do not multiply friction
     coulomb: np.ndarray | None  # (o,) index of Coulomb friction of each output, or None without static friction
     velocity: np.ndarray  # (o,) speed below which friction has no sign
     # (P,): labels of groups whose standard deviations are learned. They are independent of each other. Empty: it stays.
@@ -69,9 +69,9 @@ class Weights:
     prior: Prior
     noise: list[JointNoise]  # of each output
     correlation_time: np.ndarray  # (o,) number of rows with the information of an independent row
-    inflation: float  # factor by which groups differ more, at least 1; the covariance includes it
-    # Distance of the weights from the prior mean in prior standard deviations: root mean square over the directions
-    # that rows determine, near 1 if the prior is right.
+    inflation: float  # factor by which groups differ more than predicted, at least 1. The covariance includes it
+    # Distance of the weights from the prior mean, in prior standard deviations. It is a root mean square over the
+    # directions that rows determine, near 1 if the prior is right.
     surprise: float
     determined: float  # number of these directions
     # (P,): learned factors of the standard deviations of the prior as given. ``prior`` includes them.
@@ -91,12 +91,12 @@ class Weights:
         return _forward(features, self.mean, self.prior)
 
     def with_others(self, q: int) -> Weights:
-        """Return a start for a prior with q more weights (`with_others`), which are 0."""
+        """Return a starting point for a prior with q more weights (`with_others`), which are 0."""
         at = [self.n_weights] * q
         return replace(self, mean=np.insert(self.mean, at, 0.0), factors=np.insert(self.factors, at, 1.0))
 
     def given(self, first: np.ndarray) -> Weights:
-        """Return the posterior with the first weights set, and the others at their conditional mean."""
+        """Return the posterior with given first weights, and with the conditional mean of the others."""
         n = len(first)
         scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         unit = np.where(scale > 0.0, scale, 1.0)
@@ -108,13 +108,13 @@ class Weights:
         return replace(self, mean=mean)
 
     def variance(self, features: np.ndarray) -> np.ndarray:
-        """Return the variance of predictions by the weights' uncertainty, (n, o), to first order in the gains."""
+        """Return the variance of predictions due to weights and gains, (n, o), to first order in the gains."""
         slopes, _ = _linearised(features, np.zeros(features.shape[:2]), self.mean, self.prior)
         return np.maximum(np.einsum("nop,nop->no", slopes @ self.covariance, slopes), 0.0)
 
 
 def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: Known | None = None) -> Weights:
-    """Find the posterior of the weights: exact given noise, its correlation and gains, which are found with it."""
+    """Find the posterior of the weights, with the most likely noise, its correlation and gains."""
     # The posterior is that of a Bayesian linear model (Rasmussen & Williams 2006, eq. 2.8). Gains are linearised around
     # their last value (Gauss-Newton). The noise variance of output j is multiplied by `correlation_time`, so that
     # filtered rows count less. Scores s_b = B_bᵀ e_b of groups should then differ as much as their information
@@ -124,8 +124,8 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
     # `model.parameters.log_prior`. A step of expectation maximisation sets t to the maximum of
     # -n log t - ½ E[|z|²] t₀² / t² - ½ log² t, with n weights z of the group under the last factor t₀.
     #
-    # With a start, weights and noise start there. Otherwise they start twice, with a prior that explains nothing and
-    # one that explains nearly everything, and the more probable end is kept.
+    # If start is given, weights and noise start there. Otherwise there are two starts, one with all variance as noise
+    # and one with little noise. The more probable result is kept.
     problem = _Problem.of(rows, prior, known)
     if start is None:
         ends = [problem.settled(problem.first(share), _TRIAL_ROUNDS) for share in _FIRST_NOISE]
@@ -146,7 +146,7 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
         weight[: rows.targets.size] = inflation**-0.5
         z, covariance = _solve(B * weight[:, np.newaxis], errors * weight)
     mean, root = prior.mean + problem.root @ z, problem.root
-    # In standard deviations of the prior as given.
+    # The surprise is in standard deviations of the given prior, without factors.
     if start is not None:
         factors = factors * start.factors
     determined = float(len(z) - np.trace(covariance))
@@ -156,11 +156,11 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
 
 
 class Fold(NamedTuple):
-    """Rows that were left out, and what the weights from the other rows predict."""
+    """Held-out rows, and the torques that the weights from the other rows predict."""
 
-    out: np.ndarray  # (n,) whether a row was left out
+    out: np.ndarray  # (n,) whether a row was held out
     torques: np.ndarray  # (n, o) of all rows
-    variance: np.ndarray  # (n_out, o) of the torques of these rows, by the weights' uncertainty
+    variance: np.ndarray  # (n_out, o) of the torques of the held-out rows, due to the weights
 
 
 def folds(rows: Rows, weights: Weights) -> list[Fold]:
@@ -175,7 +175,7 @@ def folds(rows: Rows, weights: Weights) -> list[Fold]:
 
 
 class Known(NamedTuple):
-    """A few rows with the information of many: unit noise, and the same squared errors for all weights."""
+    """A few rows that replace many: with unit noise, they have the same squared errors for all weights."""
 
     features: np.ndarray  # (p + 1, o, p)
     targets: np.ndarray  # (p + 1, o)
@@ -183,9 +183,9 @@ class Known(NamedTuple):
 
 def condensed(rows: Rows, weights: Weights, effects: np.ndarray | None = None) -> Known:
     """Condense rows to the triangular factor of the whitened [H y] of each output."""
-    # effects (n, o, k) are columns whose weights are N(0, I), independent for each output and each move (``groups``).
-    # They are integrated out: the QR factorisation of [E H y; I 0 0] leaves, below the rows of E, the factor of the
-    # marginal likelihood.
+    # effects E (n, o, k) are columns with weights N(0, I), which are independent for each output and each move
+    # (``groups``). They are integrated out. In the QR factorisation of [E H y; I 0 0], the rows below the first k are
+    # the factor of the marginal likelihood.
     _, n_outputs, p = rows.features.shape
     scale = np.sqrt(weights.inflation * weights.correlation_time * _variances(weights.noise, rows.speed))
     features, targets = np.zeros((p + 1, n_outputs, p)), np.zeros((p + 1, n_outputs))
@@ -201,7 +201,7 @@ def condensed(rows: Rows, weights: Weights, effects: np.ndarray | None = None) -
 
 
 def _without(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return fewer rows with the likelihood of rows (n, m) with unit noise after columns (n, k) are integrated out."""
+    """Integrate out columns (n, k) with weights N(0, I): return fewer rows with the likelihood of rows (n, m)."""
     k = columns.shape[1]
     whole = np.block([[columns, rows], [np.eye(k), np.zeros((k, rows.shape[1]))]])
     return np.asarray(np.linalg.qr(whole, mode="r"))[k:, k:]
@@ -209,7 +209,7 @@ def _without(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _State:
-    """Weights, noise and its correlation between two rounds."""
+    """Weights, noise and its correlation after a round of `identify`."""
 
     mean: np.ndarray
     noise: list[JointNoise]
@@ -219,7 +219,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The problem of `identify`: rows, prior with its root C Cᵀ, sizes of the outputs, and known rows."""
+    """The problem of `identify`: rows, the prior with covariance C Cᵀ and root C, sizes of outputs, and known rows."""
 
     rows: Rows
     prior: Prior
@@ -234,7 +234,7 @@ class _Problem:
         return cls(rows, prior, known, _root(prior.covariance, prior.groups), np.where(size > 0.0, size, 1.0))
 
     def first(self, share: float) -> _State:
-        """Return a state with this share of each output's variance as noise."""
+        """Return the starting state, with this share of each output's variance as noise."""
         noise = [
             JointNoise(float(share * size), 0.0, float(velocity))
             for size, velocity in zip(self.size, self.prior.velocity, strict=True)
@@ -242,7 +242,7 @@ class _Problem:
         return _State(self.prior.mean, noise, np.ones(len(noise)), np.ones(len(self.prior.mean)))
 
     def settled(self, state: _State, rounds: int) -> _State:
-        """Return the state after this number of rounds, or when noise hardly changes."""
+        """Return the state after this number of rounds, or after a round with little change."""
         for _ in range(rounds):
             last, state = state, self._next(state)
             moved = [np.log(new.variance / old.variance) for new, old in zip(state.noise, last.noise, strict=True)]
@@ -303,10 +303,10 @@ class _Problem:
         return np.concatenate(Bs), np.concatenate(errors)
 
     def log_probability(self, state: _State) -> float:
-        """Return the log marginal likelihood of rows, as if independent, and factors, up to a constant."""
+        """Return the log probability of rows, as if independent, and of factors, up to a constant."""
         variances = _variances(state.noise, self.rows.speed)
         left = self.rows.targets - _forward(self.rows.features, state.mean, self.prior)
-        # By Laplace's approximation: ½ log|Σ| of the posterior covariance of z.
+        # Laplace's approximation adds ½ log|Σ|, with the posterior covariance Σ of z.
         z, covariance = _solve(*self.whitened(state))
         of_rows = np.sum(np.log(variances) + left**2 / variances)
         groups = [] if self.prior.groups is None else [group for group in dict.fromkeys(self.prior.groups) if group]
@@ -315,7 +315,7 @@ class _Problem:
 
 
 def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:
-    """Add unknown gains with c ~ N(0, scale²) each after the weights."""
+    """Add an unknown gain of each output, with c ~ N(0, scale²), after the weights."""
     if scale == 0.0:
         return prior
     mean = np.concatenate([prior.mean, np.zeros(n_outputs)])
@@ -353,7 +353,7 @@ def _forward(features: np.ndarray, mean: np.ndarray, prior: Prior) -> np.ndarray
 def _linearised(
     features: np.ndarray, targets: np.ndarray, mean: np.ndarray, prior: Prior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slopes (n, o, P) in weights and gains, and the targets of a linear model of them."""
+    """Return the slopes (n, o, P) in weights and gains, and the targets (n, o) of the linear model with them."""
     p = len(prior.scaled)
     if len(mean) == p:
         return features, targets
@@ -373,17 +373,17 @@ def _variances(noise: list[JointNoise], speed: np.ndarray) -> np.ndarray:
 
 def _solve(B: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance of z ~ N(0, I) given errors = B z + N(0, I)."""
-    # The precision is scaled to a unit diagonal, so that wide and narrow priors do not cost each other digits.
+    # The precision is scaled to a unit diagonal, so that priors of different widths do not lose accuracy.
     precision = np.eye(B.shape[1]) + B.T @ B
     scale = np.sqrt(np.diag(precision))
-    # SciPy's method. NumPy's divide and conquer fails to converge on some finite matrices.
+    # This is SciPy's eigh, because NumPy's divide and conquer does not converge for some finite matrices.
     eigenvalues, vectors = eigh(precision / np.outer(scale, scale))
     root = vectors / np.sqrt(np.maximum(eigenvalues, _SINGULAR)) / scale[:, np.newaxis]
     return root @ (root.T @ (B.T @ errors)), root @ root.T
 
 
 def _inflation(B: np.ndarray, errors: np.ndarray, covariance: np.ndarray, groups: np.ndarray) -> float:
-    """Return Σ_b s_bᵀ Λ⁻¹ s_b over its expectation Σ_b tr(Λ⁻¹ G_b - Λ⁻¹ G_b Λ⁻¹ G_b), at least 1."""
+    """Return Σ_b s_bᵀ Λ⁻¹ s_b divided by its expectation Σ_b tr(Λ⁻¹ G_b - Λ⁻¹ G_b Λ⁻¹ G_b), but at least 1."""
     seen = expected = 0.0
     for group in np.unique(groups):
         part = B[groups == group].reshape(-1, B.shape[2])
@@ -395,7 +395,7 @@ def _inflation(B: np.ndarray, errors: np.ndarray, covariance: np.ndarray, groups
 
 
 def _root(covariance: np.ndarray, groups: np.ndarray | None) -> np.ndarray:
-    """Return C with C Cᵀ = covariance, which may be singular, without entries between groups."""
+    """Return C with C Cᵀ = covariance and no entries between groups. The covariance may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     unit = np.where(scale > 0.0, scale, 1.0)
     labels = np.zeros(len(scale)) if groups is None else groups

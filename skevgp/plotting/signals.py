@@ -27,7 +27,7 @@ class SignalsDisplay:
     """Recorded and processed velocities, accelerations and torques of a log, with the cuts.
 
     The vertical axes fit the processed signals, because recorded accelerations are mostly noise. If the file has no
-    accelerations, differences of velocities are drawn. Read m and N instead of rad and N m for prismatic joints.
+    accelerations, differences of velocities are drawn. For prismatic joints, rad means m and N m means N.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model
-        Name of `list_robots`, path of a URDF file, or a model, which is checked.
+        Name from `list_robots`, path of a URDF file, or a model. A model is checked too.
     joints : sequence of str, default=None
         Names of the joints that move, in the order of the robot, such as those of a log. All other joints are locked at
         position 0, or at the limit nearest to 0. Their links become part of the link before them. If None, all joints
@@ -67,8 +67,8 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     Warns
     -----
     RobotModelWarning
-        If no body can have the moments of inertia of a link, because they violate the triangle inequality by more than
-        the rounding of their digits. If a file has numbers that are not used, such as a negative limit. If a link of a
+        If the moments of inertia of a link violate the triangle inequality, which no body does, by more than the
+        rounding of their digits. If a file has numbers that are not used, such as a negative limit. If a link of a
         file has a negative mass.
 
     See Also

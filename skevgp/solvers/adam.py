@@ -21,7 +21,7 @@ _WINDOW, _FEWEST = 50, 1500
 
 
 class Adam(MiniBatchSolver):
-    """Adam on mini-batches over all parameters, including those of q, as in the paper.
+    """Adam on mini-batches over all parameters, including those of the approximate posterior q, as in the paper.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ class Adam(MiniBatchSolver):
         the last steps only.
 
     posterior : {"full", "diagonal"}, default="full"
-        Covariance of q. If ``"full"``, q is one joint Gaussian of inducing values and weights. If ``"diagonal"``, it is
-        diagonal in both, as in the paper.
+        Covariance of the approximate posterior q. If ``"full"``, q is one joint Gaussian of inducing values and
+        weights. If ``"diagonal"``, its covariance is diagonal, as in the paper.
     bound : {"titsias", "tight"}, default="titsias"
         Lower bound that is maximised, of Titsias (2009) or of Titsias (2025). At the same parameters the tight bound is
         at least as high, and predictions are the same. See :doc:`/guide/bounds`.

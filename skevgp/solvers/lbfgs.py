@@ -32,7 +32,7 @@ class Descent:
 
 
 class LBFGS(Solver):
-    """L-BFGS on the bound with q at its optimum. Use it for most fits.
+    """L-BFGS on the lower bound, with the approximate posterior at its optimum. Use it for most fits.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ class LBFGS(Solver):
         of y that the bound belongs to. Raise StopIteration to end the fit with the best parameters so far.
 
     posterior : {"full", "diagonal"}, default="full"
-        Covariance of q. If ``"full"``, q is one joint Gaussian of inducing values and weights. If ``"diagonal"``, it is
-        diagonal in both, as in the paper.
+        Covariance of the approximate posterior q. If ``"full"``, q is one joint Gaussian of inducing values and
+        weights. If ``"diagonal"``, its covariance is diagonal, as in the paper.
     bound : {"titsias", "tight"}, default="titsias"
         Lower bound that is maximised, of Titsias (2009) or of Titsias (2025). At the same parameters the tight bound is
         at least as high, and predictions are the same. See :doc:`/guide/bounds`.

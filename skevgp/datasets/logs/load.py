@@ -112,7 +112,7 @@ def load_log(
     joints : sequence of str, default=None
         Joints to read from a rosbag2 recording, or names for the joints of a table. If None, all joints.
     gains : float or array-like of shape (n_joints,), default=1.0
-        Torque per effort: 1 if efforts are in N m, or N m per A.
+        Torque per unit of effort: 1 if efforts are in N m, and gains in N m/A if they are currents.
     coupling : array-like of shape (n_joints, n_joints), default=None
         Matrix A with q_joint = A q_motor, if the file has the signals of motors. If None, the file has the signals of
         joints.
@@ -127,7 +127,7 @@ def load_log(
         Whether to unwrap angles that start again after a turn. A number is the period. If ``"auto"``, only clear turns
         are unwrapped.
     robot : str, path-like, System or pinocchio.Model, default=None
-        Robot, as in `load_robot`. ``wrap="auto"`` then knows the limits of the joints.
+        Robot, as in `load_robot`. ``wrap="auto"`` then uses the limits of its joints.
     keep : slice, tuple or sequence of them, default=None
         Rows to read: ``slice(first, stop)`` counts rows from 0, and ``(first, last)`` are seconds since the first row.
         For several files, pass a list. If None, all rows are read.
@@ -136,7 +136,7 @@ def load_log(
     cutoff : float, default=5.0
         Cutoff frequency of the filter, Hz. If None, signals are filtered only against aliasing.
     max_gap : float, default=None
-        Longest step that is no gap, s. If None, 5 times the median step.
+        Longest time step that does not count as a gap, s. If None, 5 times the median step.
     rest_velocity : float, default=0.01
         Velocity in rad/s or m/s below which a joint is at rest. If 0, no rest is cut.
     rest_time : float, default=0.5
@@ -152,7 +152,7 @@ def load_log(
         - ``data`` : ndarray of shape (n_rows, 3 * n_joints), with positions (rad or m), velocities and accelerations;
         - ``target`` : ndarray of shape (n_rows, n_joints), with torques (N m) or forces (N);
         - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
-        - ``pieces`` : ndarray of shape (n_rows,), with numbers that differ if a gap or rest lies between rows;
+        - ``pieces`` : ndarray of shape (n_rows,), with the piece of each row. A gap or rest begins a new piece;
         - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
         - ``recordings`` : list of Bunch, one for each file, with
 
@@ -179,7 +179,7 @@ def load_log(
     TypeError
         If an argument is of the wrong type.
     OSError
-        If a file is missing or must not be read.
+        If a file is missing, or its permissions do not allow reading.
     ImportError
         If rosbags or Pinocchio is needed and not installed. The message gives the pip command.
 

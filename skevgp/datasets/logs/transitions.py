@@ -20,8 +20,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
     the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
-    gap, a jump of a position or rest are left out, and so are rows with the time of another row. With a ``delay`` of
-    `load_log`, torques are means of efforts that were recorded later than the transition by the delay.
+    gap, a jump of a position or rest are left out, and so are rows with the time of another row. If `load_log`
+    had a ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     See Also
     --------
-    load_log : Reads the files.
+    load_log : Read the files.
 
     Notes
     -----
