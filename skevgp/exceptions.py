@@ -8,7 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import RLock
 
-__all__ = ["DependentRowsWarning", "InconsistentVersionWarning", "RobotModelWarning", "UnidentifiedWarning"]
+__all__ = [
+    "DependentRowsWarning",
+    "InconsistentVersionWarning",
+    "RobotModelWarning",
+    "UnidentifiedWarning",
+    "UnstableRolloutWarning",
+]
 
 _filters = RLock()
 
@@ -90,6 +96,25 @@ class UnidentifiedWarning(UserWarning):
     >>> from skevgp.exceptions import UnidentifiedWarning
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", UnidentifiedWarning)
+    """
+
+
+class UnstableRolloutWarning(UserWarning):
+    """Warning that a few particles of a rollout run away, and dominate its mean and standard deviation.
+
+    `skevgp.rollout` gives it. Particles that leave the training data follow a function that the data do not determine.
+    Quantiles of ``samples`` describe the other particles.
+
+    See Also
+    --------
+    skevgp.rollout : Multi-step predictions.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from skevgp.exceptions import UnstableRolloutWarning
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", UnstableRolloutWarning)
     """
 
 

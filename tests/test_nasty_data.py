@@ -27,14 +27,18 @@ def test_rows_on_top_of_each_other_count_as_one_place():
     np.testing.assert_allclose(model.predict([[0.0], [3.0]]), [0.0, 3.0], atol=0.2)
 
 
-@pytest.mark.parametrize("constant", [0.1, 0.3, 1e8 + 0.1])
+STEPS_OF_A_CLOCK = np.diff(0.01 * np.arange(20000, 21001))  # 0.01 ± 3e-14
+
+
+@pytest.mark.parametrize("constant", [0.1, 0.3, 1e8 + 0.1, STEPS_OF_A_CLOCK], ids=["0.1", "0.3", "1e8", "clock"])
 def test_constant_column_may_move_a_little_afterwards(constant):
-    """The mean of equal numbers rounds; the column must not end with a lengthscale of 1e-17."""
+    """Rounding must not give the column a length scale of 1e-17."""
     rng = np.random.RandomState(0)
-    X = np.column_stack([rng.uniform(-2, 2, 1000), np.full(1000, constant)])
+    X = np.column_stack([rng.uniform(-2, 2, 1000), np.broadcast_to(constant, 1000)])
     y = np.sin(2 * X[:, 0]) + 0.05 * rng.randn(1000)
     model = EVGPRegressor(n_inducing=15, random_state=0, solver=LBFGS(tol=1.0)).fit(X, y)
     assert model.score(X * [1.0, 1.0 + 1e-9], y) > 0.99
+    assert model.kernel_.k2.length_scale[1] > 1e-4
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e8])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import Bunch, check_random_state
 
-from ..exceptions import ignored
+from ..exceptions import UnstableRolloutWarning, ignored, warn_user
 from ..utils.frames import as_fitted, package_of
 from ..utils.validation import LARGEST, as_floats, check_fitted, check_integer
 
@@ -20,8 +20,15 @@ Controller = Callable[[np.ndarray, int], ArrayLike]
 
 _METHODS = ("sample", "linearized", "mean")
 _NOISES = ("learned", "none")
+_REMEDY = (
+    "The model is unstable there, or they left the training data. Use more inducing points, more data, fewer steps, or "
+    'method="linearized".'
+)
 # Width of finite differences, as a share of the standard deviations.
 _SHARE = 0.01
+# Particles run away if a standard deviation is larger than the interquartile range by this factor. That of a normal
+# distribution is 0.74 times its interquartile range.
+_RUNAWAY = 100.0
 
 
 def rollout(
@@ -75,6 +82,11 @@ def rollout(
         If shapes do not fit, a value is not finite, or the regressor has no ``return_std``.
     NotFittedError
         If the regressor is not fitted.
+
+    Warns
+    -----
+    UnstableRolloutWarning
+        If a few particles run away, and dominate mean and standard deviation.
 
     Notes
     -----
@@ -203,10 +215,11 @@ def _sampled(
         z = batch[of[own]]
         for t in range(n_steps):
             u = drive.at(t, z, of[own])
-            z = _within_limits(step(np.hstack([z, u])), t)
+            z = _within_limits(step(np.hstack([z, u])), t, "particles")
             paths[own, t], inputs[own, t] = z, u
     samples = paths.reshape(len(batch), n_samples, n_steps, n_states)
     mean = samples.mean(axis=1)
+    _warn_of_runaways(samples)
     deviations = np.moveaxis(samples - mean[:, np.newaxis], 1, 3)  # (batch, steps, states, samples)
     covariance = deviations @ np.swapaxes(deviations, 2, 3) / max(n_samples - 1, 1)
     found = {"mean": mean, "std": np.sqrt(np.einsum("btii->bti", covariance)), "covariance": covariance}
@@ -294,10 +307,29 @@ def _finite(given: ArrayLike, name: str) -> np.ndarray:
     return values
 
 
-def _within_limits(values: np.ndarray, t: int) -> np.ndarray:
-    if not (np.abs(values) <= LARGEST).all():
-        raise ValueError(f"States grow beyond {LARGEST:g} at step {t}. The learned system is unstable.")
+def _within_limits(values: np.ndarray, t: int, of: str = "rollouts") -> np.ndarray:
+    large = ~(np.abs(values) <= LARGEST).all(axis=tuple(range(1, values.ndim)))
+    if large.any():
+        raise ValueError(
+            f"States of {large.sum()} of {len(values)} {of} grow beyond {LARGEST:g} at step {t}. {_REMEDY}"
+        )
     return values
+
+
+def _warn_of_runaways(samples: np.ndarray) -> None:
+    """Warn if a few of the samples (n_batch, n_samples, n_steps, n_states) dominate the standard deviation."""
+    low, middle, high = np.percentile(samples, [25.0, 50.0, 75.0], axis=1)
+    width = high - low
+    large = (samples.std(axis=1) > _RUNAWAY * width) & (width > 0.0)
+    if large.any():
+        step = int(np.flatnonzero(large.any(axis=(0, 2)))[0])
+        far = np.abs(samples - middle[:, np.newaxis]) > _RUNAWAY * width[:, np.newaxis]
+        count = int((far & large[:, np.newaxis]).any(axis=(2, 3)).sum())
+        warn_user(
+            f"From step {step} on, {count} of {samples.shape[0] * samples.shape[1]} particles run away, and dominate "
+            f"mean and std. Quantiles of samples describe the others. {_REMEDY}",
+            UnstableRolloutWarning,
+        )
 
 
 def _deviations(covariance: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp.exceptions import UnstableRolloutWarning
 from skevgp.features import LogNormal, ParametricFeatures
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
@@ -251,5 +252,28 @@ def test_system_that_runs_away_raises(data):
     X, _ = data
     model = EVGPRegressor(FunctionTransformer(), n_inducing=5, **QUICK).fit(X, 1e3 * X[:, :2])
     for method in ("sample", "mean", "linearized"):
-        with pytest.raises(ValueError, match="States grow beyond 1e.100 at step"):
+        with pytest.raises(ValueError, match=r"States of \d+ of \d+ (particles|rollouts) grow beyond 1e.100 at step"):
             rollout(model, Z0, np.zeros((60, 1)), method=method, n_samples=3, random_state=0)
+
+
+class Escape(BaseEstimator):
+    """A stable step up to |z| = 3, from which states grow by half in each step."""
+
+    def fit(self, X, y):
+        self.n_features_in_ = X.shape[1]
+        return self
+
+    def predict(self, X, return_std=False):
+        z = X[:, :1]
+        mean = np.where(np.abs(z) < 3.0, 0.5 * z, 1.5 * z)
+        return mean, np.ones_like(z)
+
+
+def test_particles_that_run_away_raise_a_warning():
+    # After the first step particles are N(1.45, 1), so that about 6 % of them pass 3.
+    model = Escape().fit(np.zeros((2, 2)), np.zeros(2))
+    with pytest.warns(UnstableRolloutWarning, match=r"of 100 particles run away") as caught:
+        ahead = rollout(model, [2.9], np.zeros((60, 1)), random_state=0)
+    assert len(caught) == 1
+    assert ahead.std[-1] > 1e6
+    rollout(model, [2.9], np.zeros((3, 1)), random_state=0)
