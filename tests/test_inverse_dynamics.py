@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pinocchio
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.preprocessing import StandardScaler
 
@@ -135,6 +135,9 @@ def test_payload_lies_in_its_interval(arm, rigid):
     nothing = rigid.estimate_payload(arm.X, arm.y, groups=arm.groups)
     assert nothing.mass_interval[0] < 0.0 < nothing.mass_interval[1]
     assert abs(nothing.mass) < 0.1
+    first = arm.groups == arm.groups[0]
+    one = [rigid.estimate_payload(arm.X[first], arm.y[first], groups=labels) for labels in (None, arm.groups[first])]
+    assert_array_equal(one[0].parameters, one[1].parameters)
 
 
 def test_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
@@ -461,6 +464,8 @@ def test_weaknesses_of_a_log_are_named():
     assert any(one.startswith("['q2'] never move") for one in said)
     said = warnings_of(arm.X, arm.y * [0.01, 1.0], groups=arm.groups)
     assert any(one.startswith("Torques of ['q1'] are at most") for one in said)
+    said = warnings_of(arm.X, arm.y * [1.0, -1.0], groups=arm.groups)
+    assert any(one.startswith("Torques of ['q2'] have the opposite sign") for one in said)
     # A filter as long as a fifth of the log: few independent rows.
     few = Arm("acrobot", error=0.05, n_groups=1)
     slow = np.apply_along_axis(np.convolve, 0, np.random.default_rng(0).normal(size=(549, 2)), np.ones(50), "valid")

@@ -8,8 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_toeplitz
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import check_is_fitted
 
+from ..exceptions import warn_user
 from ..utils.state import StatefulEstimator
 from ..utils.validation import check_real, checked_groups, unchanged_if_it_fails
 from .inverse_dynamics import InverseDynamics
@@ -20,6 +22,8 @@ _PUSHES, _WINDOWS = (0.05, 0.15, 0.4), 2
 _APART = 1.0
 # Share of the maxima of the statistic that its tail is fitted to, and their least number.
 _TAIL, _FEWEST = 0.25, 8
+# Free motion is too short if the threshold is larger than the largest statistic in it by this factor.
+_FAR = 10.0
 # White noise that is added to the variance of errors, as a share of it.
 _WHITE = 1e-3
 
@@ -123,6 +127,12 @@ class ContactMonitor(StatefulEstimator):
         ValueError, TypeError
             If an argument is out of its range, or the model is not an `InverseDynamics`. Also if the log, without the
             first 0.8 s of each piece, is shorter than 16 s.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If the free motion is too short for ``false_alarms_per_hour``. The threshold is then more than 10 times the
+            largest statistic.
         """
         if not isinstance(self.model, InverseDynamics):
             raise TypeError(f"model must be a fitted InverseDynamics; got {type(self.model).__name__}.")
@@ -146,8 +156,8 @@ class ContactMonitor(StatefulEstimator):
         judged = sum(len(one) for one in filtered)
         if judged < 2 * _FEWEST * block:
             raise ValueError(
-                f"fit needs at least {2 * _FEWEST * block} rows of free motion, without the first {self._window} of "
-                f"each piece; got {judged}."
+                f"fit needs at least {2 * _FEWEST * _APART:g} s of free motion, without the first "
+                f"{self._window * step:.3g} s of each piece; got {judged * step:.3g} s ({judged} rows)."
             )
         together = np.concatenate(filtered)
         scale = np.sqrt(np.mean(together**2, axis=0))
@@ -158,6 +168,15 @@ class ContactMonitor(StatefulEstimator):
         gain = np.abs(self._filters[:, -1, -self._lengths[-1] :].sum(axis=1)) / self.scale_[:, -1]
         self.detectable_ = self.threshold_ * np.sqrt(np.mean(std**2, axis=0)) / gain
         self.reset()
+        if self.threshold_ > _FAR * maxima.max():
+            torques = ", ".join(f"{torque:.3g}" for torque in self.detectable_)
+            warn_user(
+                f"{3600.0 * self.hours_:.0f} s of free motion are too short for false_alarms_per_hour={rate:g}. The "
+                f"threshold is {self.threshold_ / maxima.max():.0f} times the largest statistic of this motion. So "
+                f"only pushes above detectable_ = [{torques}] raise an alarm. Record more free motion, or raise "
+                "false_alarms_per_hour.",
+                ConvergenceWarning,
+            )
 
     def score_samples(self, X: ArrayLike, y: ArrayLike, *, pieces: ArrayLike | None = None) -> np.ndarray:
         """Return the statistic of each row.

@@ -241,7 +241,7 @@ class IdentifiedRobot(TorqueRegression):
         payload : Bunch
             Parameters of the payload:
 
-            - ``mass``, ``mass_std`` : mass, kg;
+            - ``mass``, ``mass_std`` : mass, kg. A mass below 0 is possible if the errors are large;
             - ``mass_interval`` : tuple of two floats, the 95 % credible interval of the mass, kg;
             - ``com``, ``com_std`` : ndarray of shape (3,), centre of mass in the frame of the link's joint, m. The
               standard deviation is to first order. They are NaN and inf if the mass is not positive;
@@ -286,8 +286,8 @@ class IdentifiedRobot(TorqueRegression):
         def effects(torque: np.ndarray) -> np.ndarray:
             return self._effects(torque, rows.speed)
 
-        # Without labels, the log is one move.
-        rows = replace(rows, groups=np.zeros(len(rows_x), dtype=int)) if groups is None else rows
+        # Without labels, or with one label, the log is one move.
+        rows = replace(rows, groups=np.zeros(len(rows_x), dtype=int)) if rows.n_moves == 1 else rows
         n_effects = len(np.unique(rows.groups)) * n_outputs * len(EFFECTS)
         prior = payload_prior(self._weights.prior, n_effects, mass_scale, size)
         torque = self._weights.predict(rows.features)

@@ -40,6 +40,8 @@ _FAR = 4.0
 _LITTLE = 0.5
 # Above this share, `fit` tests whether columns are in another order or in degrees.
 _DOUBTFUL = 0.1
+# Number of weights that a warning names.
+_MOST_NAMED = 3
 # Limits of torques. Between them, variances and their ratios to noise variances neither vanish nor overflow.
 _SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
 # Rows below the speed v_s count less for f_j, and v_s is at most this value. Filters also blur the sign of friction at
@@ -324,8 +326,18 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             f"The robot's model does not fit the torques. {named}{'Otherwise, its' if causes else 'Its'} masses may be "
             "placeholders, or y may have other units. "
             f"Give {'' if self.learn_scales else 'RigidBodyRegressor wider scales, or '}y in N m. The weights are "
-            f"{self._weights.surprise:.1f} prior standard deviations from the model.{little}"
+            f"{self._weights.surprise:.1f} prior standard deviations from the model, mostly "
+            f"{self._furthest(y.shape[1])}.{little}"
         )
+
+    def _furthest(self, n_outputs: int) -> str:
+        """Return the names of the weights that are furthest from the robot's model, in its standard deviations."""
+        names, weights = self._names(n_outputs), self._weights
+        n = len(names)
+        scale = np.sqrt(np.diag(weights.prior.covariance))[:n] / weights.factors[:n]
+        change = np.abs(weights.mean - weights.prior.mean)[:n] / np.where(scale > 0.0, scale, np.inf)
+        largest = [str(names[at]) for at in np.argsort(-change)[:_MOST_NAMED]]
+        return f"{', '.join(largest[:-1])} and {largest[-1]}" if len(largest) > 1 else largest[0]
 
     def _check_columns_of_y(self, y: ArrayLike) -> None:
         """Raise ValueError for a data frame with the robot's joints in another order."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import lfilter
-from sklearn.exceptions import NotFittedError
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
 
 from skevgp import ContactMonitor, InverseDynamics
 
@@ -95,6 +95,11 @@ def test_fit_takes_no_errors_across_gaps(model, monitor):
         assert_allclose(getattr(again, name), getattr(found, name), rtol=1e-6)
 
 
+def test_free_motion_that_is_too_short_raises_a_warning(model):
+    with pytest.warns(ConvergenceWarning, match=r"60 s of free motion are too short for false_alarms_per_hour=1e-06"):
+        ContactMonitor(model, dt=DT, false_alarms_per_hour=1e-6).fit(*log(60.8, 1))
+
+
 def test_invalid_use_raises(model):
     X, y = log(60.0, 0)
     fresh = partial(ContactMonitor, model, dt=DT)
@@ -103,7 +108,7 @@ def test_invalid_use_raises(model):
             getattr(fresh(), method)(X, y)
     with pytest.raises(NotFittedError):
         ContactMonitor(InverseDynamics("pendulum"), dt=DT).fit(X, y)
-    with pytest.raises(ValueError, match=r"needs at least 320 rows.*got 285"):
+    with pytest.raises(ValueError, match=r"needs at least 16 s .* the first 0.8 s .*got 14.2 s \(285 rows\)"):
         fresh().fit(X[:300], y[:300])
     with pytest.raises(ValueError, match="got 0"):
         fresh().fit(X, y, pieces=np.arange(len(y)) // 10)
