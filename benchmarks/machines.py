@@ -508,10 +508,10 @@ def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
 
 
 PARTS = {  # CSV, function, tables, title
-    "inverse": ("machines", run_inverse, inverse_tables, "Torques of machines"),
+    "inverse": ("machines", run_inverse, inverse_tables, "Torques of machines on new moves"),
     "forward": ("machines_forward", run_forward, forward_tables, "Motion of machines"),
-    "contact": ("machines_contact", run_contact, contact_tables, "Contact"),
-    "check": ("machines_check", run_check, check_tables, "Logs that do not fit"),
+    "contact": ("machines_contact", run_contact, contact_tables, "Detection of contact"),
+    "check": ("machines_check", run_check, check_tables, "Logs that do not fit the model"),
 }
 
 

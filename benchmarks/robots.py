@@ -690,9 +690,9 @@ def payload(options: Any, output: Path) -> tuple[harness.Tables, int]:
 
 
 PARTS = {  # CSV, function, title
-    "payload": ("payload", payload, "Payloads, and friction, of arms"),
+    "payload": ("payload", payload, "Payloads and friction of arms"),
     "real": ("real_arms", real, "Torques of real arms"),
-    "identification": ("identification", identification, "What is identified of a simulated arm"),
+    "identification": ("identification", identification, "Identification of a simulated arm"),
 }
 
 
