@@ -161,7 +161,7 @@ def main() -> None:
     ]
     n_failures = harness.run_missing(cells, partial(run, folder=options.folder), output, options.jobs)
     rows = harness.frame(output, size=options.size)
-    harness.write_page("Standard deviations that hold", tables_of(rows), output, n_failures)
+    harness.write_page("Calibrated standard deviations", tables_of(rows), output, n_failures)
 
 
 if __name__ == "__main__":

@@ -435,7 +435,7 @@ def tables_of_inducing(rows: pd.DataFrame) -> harness.Tables:
     covered = sparse["upper"] >= sparse["likelihood"] - 1e-6 * sparse["likelihood"].abs()
     counts = {
         f"sets within {ENOUGH} nats per row of the exact model": lost <= ENOUGH,
-        "sets with at most twice the smallest number of the grid that is": ratio <= 2.0,
+        "sets where auto's m is at most twice the smallest m": ratio <= 2.0,
         "fits whose upper bound covers the exact log marginal likelihood": covered,
     }
     lines = [(name, f"{held.sum()} of {len(held)}") for name, held in counts.items()]
@@ -467,7 +467,7 @@ def main() -> None:
         fits = [Fit(name, seed, model) for seed in options.seeds for model in FITS for name in names]
         n_failures = harness.run_missing(fits, run_inducing, output, options.jobs)
         tables = tables_of_inducing(harness.frame(output))
-        harness.write_page("Inducing points that are chosen", tables, output, n_failures)
+        harness.write_page("Automatic number of inducing points", tables, output, n_failures)
 
 
 if __name__ == "__main__":
