@@ -568,7 +568,7 @@ def tracking_tables(rows: pd.DataFrame) -> harness.Tables:
 
 
 PARTS: dict[str, tuple[Any, ...]] = {  # cells, run, tables, title
-    "rollouts": (rollout_cells, run_rollouts, rollout_tables, "Many steps ahead"),
+    "rollouts": (rollout_cells, run_rollouts, rollout_tables, "Predictions of many steps"),
     "swing_up": (swing_up_cells, run_swing_up, swing_up_tables, "Seconds of data that a swing-up needs"),
     "tracking": (tracking_cells, run_tracking, tracking_tables, "An arm with an unknown load"),
 }

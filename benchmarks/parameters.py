@@ -421,7 +421,7 @@ def cells_of(options: Any) -> list[Any]:
 
 PARTS = {  # CSV, function, tables, title
     "pendulum": ("parameters", run_pendulum, pendulum_tables, "Parameters of a pendulum"),
-    "misfit": ("parameters_misfit", run_misfit, misfit_tables, "Simulators that are wrong"),
+    "misfit": ("parameters_misfit", run_misfit, misfit_tables, "Wrong simulators"),
     "real": ("parameters_real", run_real, real_tables, "Parameters of a real pendulum"),
     "cost": ("parameters_cost", run_cost, cost_tables, "Cost of parameters"),
 }

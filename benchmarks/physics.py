@@ -268,10 +268,10 @@ TABLES = {
 }
 FILES = {"errors": "physics", "curves": "physics_curves", "wrong": "physics_wrong", "rollouts": "physics_rollouts"}
 TITLES = {
-    "errors": "What physics in the model gains",
-    "curves": "What physics gains as data grow",
-    "wrong": "Features that are wrong",
-    "rollouts": "Many steps ahead with as many inducing points",
+    "errors": "Gain from physics in the model",
+    "curves": "Gain from physics as data grow",
+    "wrong": "Wrong features",
+    "rollouts": "Rollouts with equal numbers of inducing points",
 }
 
 

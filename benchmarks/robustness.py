@@ -210,7 +210,7 @@ def main() -> None:
     options = harness.parse(harness.argument_parser(__doc__, quick="a few fits of each part"))
     output = harness.output_path(options, "robustness")
     n_failures = harness.run_missing(cells_of(options.quick), run, output, options.jobs)
-    title = "Fits of nasty data, and of other random states"
+    title = "Fits to difficult data, and with other random states"
     harness.write_page(title, tables_of(harness.frame(output)), output, n_failures)
 
 

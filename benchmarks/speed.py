@@ -527,7 +527,7 @@ def checkout_tables(rows: pd.DataFrame) -> harness.Tables:
 
 
 PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables, title
-    "latency": ("latency", latency_cells, run_latency, latency_tables, "What a control loop waits for"),
+    "latency": ("latency", latency_cells, run_latency, latency_tables, "Latency of predictions"),
     "casadi": ("casadi_latency", casadi_cells, run_casadi, casadi_tables, "A prediction by CasADi and in C"),
     "evaluation": (
         "evaluation_cost",
@@ -537,7 +537,7 @@ PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables,
         "One evaluation of the bound and its gradient",
     ),
     "rows": ("scaling", rows_cells, run_rows, rows_tables, "Time and memory over rows"),
-    "million": ("many_rows", million_cells, run_million, million_tables, "1,000,000 rows"),
+    "million": ("many_rows", million_cells, run_million, million_tables, "A fit to 1,000,000 rows"),
     "checkout": ("checkout", checkout_cells, run_checkout, checkout_tables, "This checkout against another"),
 }
 
