@@ -1,6 +1,6 @@
 """Are standard deviations calibrated, without calibration (noise_cv=None) and with the default?
 
-Systems are fitted with ``groups=train.groups`` and tested on new trajectories. Tables of independent rows are fitted
+Systems are fitted with ``groups=train.groups``, and tested on new trajectories. Tables of independent rows are fitted
 with their rows shuffled or sorted by a column, and tested on held-out rows.
 
     python benchmarks/calibration.py                 # four systems, four tables, four seeds: half an hour

@@ -1,7 +1,7 @@
 """The paper's Table 3: time and space against inducing points, rows, outputs and units.
 
-Measures evaluations of the bound with its gradient, steps of Adam in the paper's setting, steps of the network, and the
-size of fitted models. Exponents of power laws are fitted to the CSV.
+The script measures evaluations of the bound with its gradient, steps of Adam in the paper's setting, steps of the
+network, and the size of fitted models. Exponents of power laws are fitted to the CSV.
 
     python benchmarks/paper/table3.py                    # two minutes of an idle core
     python benchmarks/paper/table3.py --quick            # few sizes, seconds
