@@ -14,9 +14,9 @@ within 1, 2 and 3 standard deviations. The data are the paper's, or a tenth of t
 of each state's standard deviation. iiwa14 learns from its moves of 50 steps, and is tested on slower ones of 100.
 
 *swing_up* has the planner of examples/mpc.py. It swings up a pole from rest, by iLQR on the model at each step (0.03
-s). The limits are 100 N on the cart and 2 N m on the pendulum. The pendulum needs more than twice this torque to be held
-level. A run succeeds if the pole is within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG, or a
-Gaussian process of the change of state without physics. Both have sines and cosines for the kernel, and learn from
+s). The limits are 100 N on the cart and 2 N m on the pendulum. The pendulum needs more than twice this torque to be
+held level. A run succeeds if the pole is within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG,
+or a Gaussian process of the change of state without physics. Both have sines and cosines for the kernel, and learn from
 short trajectories from random states. "Firm" is EVGP-IFG with the prior of the paper's setting, with a hundredth of its
 scale for the weights of states in states. This prior has rough physics and exact kinematics. Noise is a share of the
 states' standard deviation, in the data and in the states that the planner gets. "The truth" plans on the simulated
