@@ -5,11 +5,13 @@
     python benchmarks/bounds.py --quick
 
 The tables airfoil, elevators and kin40k are read from --data-folder: NAME/data.csv.gz with the target last, and
-NAME/test_mask.csv.gz with a column per split. Of the training rows 5,000 at most are used. Dynamics have noise of 1 %,
+NAME/test_mask.csv.gz with a column per split. A fit uses at most 5,000 training rows. Dynamics have noise of 1 %,
 or none, and features from physics. "120 %" is the bound of 2009 with a fifth more inducing points, which takes
-about as long as the bound of 2025. Both bounds of a set, split and number of points are maximised one after the other
-in one process with one thread, from the same start and to convergence, with ``noise_cv`` and without. With 256 points
-there are two splits, and of dynamics four seeds.
+about as long as the bound of 2025.
+
+Both bounds of a set, split and number of points are maximised one after the other in one process with one thread. They
+start from the same parameters and run to convergence, with ``noise_cv`` and without. With 256 points there are two
+splits. Dynamics have four seeds.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Are standard deviations calibrated, without calibration (noise_cv=None) and with the default?
 
-Systems are fitted with ``groups=train.groups`` and tested on new trajectories. Tables of independent rows are fitted
+Systems are fitted with ``groups=train.groups``, and tested on new trajectories. Tables of independent rows are fitted
 with their rows shuffled or sorted by a column, and tested on held-out rows.
 
     python benchmarks/calibration.py                 # four systems, four tables, four seeds: half an hour
@@ -161,7 +161,7 @@ def main() -> None:
     ]
     n_failures = harness.run_missing(cells, partial(run, folder=options.folder), output, options.jobs)
     rows = harness.frame(output, size=options.size)
-    harness.write_page("Standard deviations that hold", tables_of(rows), output, n_failures)
+    harness.write_page("Calibrated standard deviations", tables_of(rows), output, n_failures)
 
 
 if __name__ == "__main__":

@@ -8,23 +8,25 @@
     python benchmarks/control.py tracking                    # a quarter of an hour of one core
     python benchmarks/control.py swing_up --quick            # the pendulum, one seed: half a minute
 
-*rollouts*: 100 steps from initial states and with inputs that were not seen, against the true states. Position errors
-are those of the mean fed back and of the particles' mean. CR-1 to CR-3 are shares of the true states within 1, 2 and 3
-standard deviations. Data are the paper's, without noise and with noise of 1 % of each state's scatter; all of them, and
-a tenth. iiwa14 learns from its moves of 50 steps, and is tested on slower ones of 100.
+*rollouts* compares predictions of 100 steps, from new initial states and with new inputs, to the true states.
+Position errors are those of the mean fed back and of the particles' mean. CR-1 to CR-3 are shares of the true states
+within 1, 2 and 3 standard deviations. The data are the paper's, or a tenth of them. They have no noise, or noise of 1 %
+of each state's standard deviation. iiwa14 learns from its moves of 50 steps, and is tested on slower ones of 100.
 
-*swing_up*: a pole is swung up from rest by the planner of examples/mpc.py, iLQR on the model at each step of 0.03 s,
-with 100 N on the cart and 2 N m on the pendulum, less than half of what holds it level. A run succeeds if the pole is
-within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG, or a Gaussian process of the change of
-state without physics, both with sines and cosines for the kernel, learned from short trajectories from random states.
-"Firm" is EVGP-IFG with the prior of the paper's setting, whose weights of states in states have a hundredth of its
-scale: rough physics, but exact kinematics. Noise is a share of the states' scatter, in the data and in what the planner
-sees. "The truth" plans on the simulated system.
+*swing_up* has the planner of examples/mpc.py. It swings up a pole from rest, by iLQR on the model at each step (0.03
+s). The limits are 100 N on the cart and 2 N m on the pendulum. The pendulum needs more than twice this torque to be
+held level. A run succeeds if the pole is within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG,
+or a Gaussian process of the change of state without physics. Both have sines and cosines for the kernel, and learn from
+short trajectories from random states. "Firm" is EVGP-IFG with the prior of the paper's setting, with a hundredth of its
+scale for the weights of states in states. This prior has rough physics and exact kinematics. Noise is a share of the
+states' standard deviation, in the data and in the states that the planner gets. "The truth" plans on the simulated
+system.
 
-*tracking*: the iiwa14 of examples/computed_torque.py has a load and friction that its model does not know, and masses
-that are 5 % off. All models learn from one log of a minute at 50 Hz, and are compared on references that were not in
-it: other waves, slow ones, and quick moves. Then moves are made as fast as limits of torque allow, where the mean, or
-the mean and k std, stay within 35 % of what motors can give (45 % with more than 3 kg).
+*tracking* has arms with unknown loads. The iiwa14 of examples/computed_torque.py has a load and friction that its model
+does not know. Its masses are 5 % off. All models learn from one log of a minute at 50 Hz. They are compared on other
+references: other waves, slow ones, and quick moves. Then moves are made as fast as limits of torque allow. The mean, or
+the mean and k standard deviations, must stay within 35 % of the largest torques of the motors (45 % with more than 3
+kg).
 """
 
 from __future__ import annotations
@@ -568,7 +570,7 @@ def tracking_tables(rows: pd.DataFrame) -> harness.Tables:
 
 
 PARTS: dict[str, tuple[Any, ...]] = {  # cells, run, tables, title
-    "rollouts": (rollout_cells, run_rollouts, rollout_tables, "Many steps ahead"),
+    "rollouts": (rollout_cells, run_rollouts, rollout_tables, "Predictions of many steps"),
     "swing_up": (swing_up_cells, run_swing_up, swing_up_tables, "Seconds of data that a swing-up needs"),
     "tracking": (tracking_cells, run_tracking, tracking_tables, "An arm with an unknown load"),
 }

@@ -6,7 +6,7 @@ The tests are those of the installed scikit-learn, with the class replaced in th
     python benchmarks/gpr_tests.py --model renamed  # with the arguments renamed too that have other names here
     python benchmarks/gpr_tests.py --model sklearn  # GaussianProcessRegressor itself
 
-Prints the counts, and each test that fails with its reason. A failure without a reason is an error.
+The script prints the counts, and each test that fails with its reason. A failure without a reason is an error.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What the benchmarks share: options, cells that run in processes, a CSV that keeps what is finished, and a page.
+"""Shared parts of the benchmarks: options, cells that run in processes, a CSV of finished cells, and a page.
 
-A benchmark measures cells. Each finished cell is added to the CSV, so a long run can be interrupted and continued; a
-row that is deleted is measured again. Tables and pictures are made from the CSV. The page beside it is text edited by
-hand; `write_page` replaces only the tables below its ``<!-- table: NAME -->`` lines.
+A benchmark measures cells. Each finished cell is added to the CSV, so a long run can be interrupted and continued. A
+deleted row is measured again. Tables and pictures are made from the CSV. The text of the page next to it is edited by
+hand. `write_page` replaces only the tables below its ``<!-- table: NAME -->`` lines.
 """
 
 from __future__ import annotations

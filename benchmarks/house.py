@@ -1,4 +1,4 @@
-"""Measure how far a reader has to walk through the package: the meters of its layout.
+"""Measure how many functions and files a reader of the package meets.
 
     python benchmarks/house.py            # print the meters and write them to benchmarks/results/house.csv
     python benchmarks/house.py --list     # also print each function that a fit enters, in order

@@ -1,4 +1,4 @@
-"""Torques, motion and contact of real and simulated machines, on moves that were not seen.
+"""Torques, motion and contact of real and simulated machines, on new moves.
 
     python benchmarks/machines.py inverse --data ../data           # a quarter of an hour of one core
     python benchmarks/machines.py forward --data ../data           # five minutes of one core
@@ -6,23 +6,23 @@
     python benchmarks/machines.py check --data ../data             # three minutes of one core
     python benchmarks/machines.py inverse --quick                  # simulated machines only, few rows: a minute
 
-The folder has the folders real (double_pendulum, simple_pendulum, kr300), ur10e and ur10, or some of them: machines
-without logs are left out, and the simulated ones need none. No row of the logs is written anywhere. A page of the
-documentation says how to add a machine.
+The data folder has the folders real (double_pendulum, simple_pendulum, kr300), ur10e and ur10, or some of them.
+Machines without logs are left out, and simulated machines need none. No row of the logs is written anywhere. A page of
+the documentation says how to add a machine.
 
-*inverse*: models of joint torques. Splits have moves to train on and moves to test on, whole. Least squares are the
-rigid-body features with friction, by `numpy.linalg.lstsq`. "updated" is `InverseDynamics` after `update` with the first
-third of each test move; its scores, and those of least squares that it is compared with, are of the rest. It needs
-three moves to train on.
+*inverse* compares models of joint torques. Each split has whole moves for training and other whole moves for tests.
+Least squares has the rigid-body features with friction, fitted by `numpy.linalg.lstsq`. "updated" is `InverseDynamics`
+after `update` with the first third of each test move. Its scores, and those of least squares that it is compared with,
+are of the rest. It needs three training moves.
 
-*forward*: models of the state after 20 ms, with `EVGPRegressor`'s defaults. Signals are filtered with 15 Hz. Rollouts
-are of a second, with the recorded torques, from 20 states of each test move.
+*forward* compares models of the state after 20 ms, with `EVGPRegressor`'s defaults. Signals are filtered with 15 Hz.
+Rollouts are of a second, with the recorded torques, from 20 states of each test move.
 
-*contact*: `ContactMonitor` is fitted to clean moves that the model was not fitted to, and judged on another one.
-Simulated pushes are twice as large as ``detectable_`` and last 0.4 s. A push counts as found if there is an alarm where
-there is none without it.
+*contact* fits `ContactMonitor` to clean moves that the model was not fitted to, and tests it on another one. Simulated
+pushes are twice as large as ``detectable_`` and last 0.4 s. A push counts as found if there is an alarm, and none
+without the push.
 
-*check*: `InverseDynamics.check_log` of moves that the model was not trained on, and of logs with a load.
+*check* runs `InverseDynamics.check_log` on moves that the model was not trained on, and on logs with a load.
 """
 
 from __future__ import annotations
@@ -508,10 +508,10 @@ def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
 
 
 PARTS = {  # CSV, function, tables, title
-    "inverse": ("machines", run_inverse, inverse_tables, "Torques of machines"),
+    "inverse": ("machines", run_inverse, inverse_tables, "Torques of machines on new moves"),
     "forward": ("machines_forward", run_forward, forward_tables, "Motion of machines"),
-    "contact": ("machines_contact", run_contact, contact_tables, "Contact"),
-    "check": ("machines_check", run_check, check_tables, "Logs that do not fit"),
+    "contact": ("machines_contact", run_contact, contact_tables, "Detection of contact"),
+    "check": ("machines_check", run_check, check_tables, "Logs that do not fit the model"),
 }
 
 

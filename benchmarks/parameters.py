@@ -1,4 +1,4 @@
-"""Parameters of physics that a fit learns: lengths, friction, and the best fit of a wrong simulator.
+"""Learned parameters of physics: lengths, friction, and the best fit of a wrong simulator.
 
     python benchmarks/parameters.py pendulum                       # four minutes of one core
     python benchmarks/parameters.py misfit                         # a quarter of an hour of one core
@@ -6,21 +6,22 @@
     python benchmarks/parameters.py cost                           # two minutes of one core
     python benchmarks/parameters.py pendulum --quick               # one seed, few rows: seconds
 
-*pendulum*: a simulated pendulum of 1 kg with viscous and Stribeck friction, four trajectories of 100 steps of 0.03 s,
-changes of the velocity with 1 % noise. Medians of the priors are 20 % off. "learned" has a `ParametricFeatures` of four
-steps of Runge and Kutta's rule with four parameters. "fixed, 20 % off" has the same function with all parameters too
-large by 20 %, "fixed, right" with the true ones. With a ripple, the motor has a torque that depends on the angle, which
-the function does not know. Errors are those of four other trajectories.
+*pendulum* has a simulated pendulum of 1 kg with viscous and Stribeck friction. Data are four trajectories of 100 steps
+of 0.03 s, and targets are changes of the velocity with 1 % noise. Medians of the priors are 20 % off. "learned" has a
+`ParametricFeatures` of four steps of Runge and Kutta's rule with four parameters. "fixed, 20 % off" has the same
+function with all parameters too large by 20 %, and "fixed, right" with the true ones. With a ripple, the motor has a
+torque that depends on the angle, which the function does not know. Errors are those of four other trajectories.
 
-*misfit*: wrong simulators of one parameter. "line" is that of Plumlee (2017): 4 x + x sin(5 x) on [0, 1], simulated by
-θ x. "decay" is that of Bayarri et al. (2007): 3.5 exp(-1.7 x) + 1.5 on [0, 3], simulated by 5 exp(-θ x). The true value
-is the best fit in least squares to the noise-free function on the rows. "projection" fits the simulator to 200 samples
-of the posterior of "free" (Xie & Xu 2021).
+*misfit* has wrong simulators of one parameter. "line" is that of Plumlee (2017): 4 x + x sin(5 x) on [0, 1], simulated
+by θ x. "decay" is that of Bayarri et al. (2007): 3.5 exp(-1.7 x) + 1.5 on [0, 3], simulated by 5 exp(-θ x). The true
+value is the best fit in least squares to the noise-free function on the rows. "projection" fits the simulator to 200
+samples of the posterior of "free" (Xie & Xu 2021).
 
-*real*: a pendulum (logs of the folder real/simple_pendulum), one step of 0.02 s and rollouts of a second. Each run is
-left out once.
+*real* has a pendulum (logs of the folder real/simple_pendulum), with one step of 0.02 s and rollouts of a second. Each
+run is left out once.
 
-*cost*: processor seconds of fits with parameters, and with the same function at fixed parameters, in turns.
+*cost* has processor seconds of fits with parameters, and with the same function at fixed parameters. These fits
+alternate.
 """
 
 from __future__ import annotations
@@ -427,7 +428,7 @@ def cells_of(options: Any) -> list[Any]:
 
 PARTS = {  # CSV, function, tables, title
     "pendulum": ("parameters", run_pendulum, pendulum_tables, "Parameters of a pendulum"),
-    "misfit": ("parameters_misfit", run_misfit, misfit_tables, "Simulators that are wrong"),
+    "misfit": ("parameters_misfit", run_misfit, misfit_tables, "Wrong simulators"),
     "real": ("parameters_real", run_real, real_tables, "Parameters of a real pendulum"),
     "cost": ("parameters_cost", run_cost, cost_tables, "Cost of parameters"),
 }

@@ -1,4 +1,4 @@
-"""What physics in the model gains: models with and without it, all with the defaults of the library.
+"""Gain from physics: models with and without it, all with the defaults of the library.
 
     python benchmarks/physics.py errors                       # hours of one core, most of them for iiwa14
     python benchmarks/physics.py errors --systems pendulum cartpole
@@ -12,17 +12,17 @@ model without features, RES-VGP learns the change of state, EVGP-IF and EVGP-IFG
 `InertiaForceGravity`. Noise is a share of each target's standard deviation. Errors are means over test rows of the norm
 of the error of the noise-free target. Coverage and the NLPD are those of noisy targets.
 
-*errors*: the systems of the paper from 4 trajectories and from the paper's number, and robots that the features'
-default prior was not made for (a double pendulum, a UR5 and a Panda) from 4 and 40.
+*errors* has the systems of the paper, with 4 trajectories and with the paper's number. It also has robots that the
+features' default prior was not made for (a double pendulum, a UR5 and a Panda), with 4 and 40.
 
-*curves*: the same errors of the smaller systems from 2 to 16 trajectories.
+*curves* has the same errors of the smaller systems, with 2 to 16 trajectories.
 
-*wrong*: features that are wrong, against the same model without features. "another robot" has the features of the
-acrobot for the cartpole, and the reverse. "gravity upwards" has a guess of gravity with the wrong sign. "noise" adds
-five features that are noise to the model of the change of state.
+*wrong* compares wrong features to the same model without features. "another robot" has the features of the acrobot for
+the cartpole, and the reverse. "gravity upwards" has a guess of gravity with the wrong sign. "noise" adds five features
+that are noise to the model of the change of state.
 
-*rollouts*: errors of positions after 100 steps of the mean, fed back, from 40 states that were not seen, relative to
-the states' scatter: the median over rollouts.
+*rollouts* has errors of positions after 100 steps of the mean, fed back, from 40 new states. They are relative to the
+standard deviation of the states, and the value is the median over rollouts.
 """
 
 from __future__ import annotations
@@ -268,10 +268,10 @@ TABLES = {
 }
 FILES = {"errors": "physics", "curves": "physics_curves", "wrong": "physics_wrong", "rollouts": "physics_rollouts"}
 TITLES = {
-    "errors": "What physics in the model gains",
-    "curves": "What physics gains as data grow",
-    "wrong": "Features that are wrong",
-    "rollouts": "Many steps ahead with as many inducing points",
+    "errors": "Gain from physics in the model",
+    "curves": "Gain from physics as data grow",
+    "wrong": "Wrong features",
+    "rollouts": "Rollouts with equal numbers of inducing points",
 }
 
 

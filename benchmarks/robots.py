@@ -1,4 +1,4 @@
-"""Torques of robots: real arms on trajectories that were not seen, and what is identified of a simulated arm.
+"""Torques of robots: real arms on new trajectories, and identification of simulated arms.
 
     python benchmarks/robots.py real --data ../data            # a quarter of an hour of one core
     python benchmarks/robots.py real --data ../data --quick    # a split per arm, few rows and iterations: a minute
@@ -6,25 +6,28 @@
     python benchmarks/robots.py identification --quick         # one run of few rows: seconds
     python benchmarks/robots.py payload --data ../data --seeds 20  # minutes; without --data of simulated arms only
 
-*real*: the folder has a folder of logs per arm. Arms without logs are left out. No row of the logs is written anywhere.
+*real* compares models of the torques of real arms. The data folder has a folder of logs per arm. Arms without logs are
+left out. No row of the logs is written anywhere.
 
-- ur10e: ur10e.urdf, and tables ur-DATE-NAME.csv.gz without a header, of time, positions, velocities and motor currents
-  of six joints (columns 1, 2-7, 8-13 and 14-19). Files whose names end in "load" (not "unload") have a load. Files that
-  never move are passed over. All others are tests, except those that a fit is trained on.
+- ur10e: ur10e.urdf, and tables ur-DATE-NAME.csv.gz without a header. They have time, positions, velocities and motor
+  currents of six joints (columns 1, 2-7, 8-13 and 14-19). Files whose names end in "load" (not "unload") have a load.
+  Files that never move are skipped. All others are tests, except those that a fit is trained on.
 - ur10: ur10_exciting_trajectory.db3 (JointState) and validation_trajectory.db3 (JointTrajectory), for the URDF "ur10"
   of example-robot-data.
 
-A second CSV has the load and the friction that were found.
+A second CSV has the identified load and friction.
 
-*identification*: a simulated arm whose masses, centres of mass and inertias differ from the model's by up to 20 %
-(`perturb_robot`), with Coulomb and viscous friction, follows two trajectories of half a minute at 100 Hz. Torques have
-noise of 2 % of their scatter. Data are given as they are, or written to a file that `load_log` reads with a filter of
-5 Hz. `InverseDynamics` is asked for weights whose posterior variance is below a quarter of the prior's (in
-eigen-directions of the posterior, in units of the prior), and for torques on other trajectories.
+*identification* has a simulated arm with Coulomb and viscous friction. Its masses, centres of mass and inertias differ
+from the model's by up to 20 % (`perturb_robot`). It follows two trajectories of half a minute at 100 Hz. Torques have
+noise of 2 % of their standard deviation. The data are used directly, or written to a file that `load_log` reads with a
+filter of 5 Hz. A combination of weights counts as identified if its posterior variance is below a quarter of the
+prior's. Combinations are eigenvectors of the posterior covariance, in units of the prior. Torques are predicted on
+other trajectories.
 
-*payload*: intervals of payloads. Simulated arms like those of *identification* have unknown velocities of friction, and
-gains with errors. Three moves are without a payload, and a fourth one with it. Moves are alike, or differ in friction
-and gains. The load of the UR10e is identified from a whole log and from its fifths, of arms known from different logs.
+*payload* measures intervals of payloads. Simulated arms like those of *identification* have unknown velocities of
+friction, and gains with errors. Three moves are without a payload, and a fourth one with it. Moves are alike, or differ
+in friction and gains. The load of the UR10e is estimated from a whole log and from its fifths, with models that are
+fitted to different logs.
 """
 
 from __future__ import annotations
@@ -690,9 +693,9 @@ def payload(options: Any, output: Path) -> tuple[harness.Tables, int]:
 
 
 PARTS = {  # CSV, function, title
-    "payload": ("payload", payload, "Payloads, and friction, of arms"),
+    "payload": ("payload", payload, "Payloads and friction of arms"),
     "real": ("real_arms", real, "Torques of real arms"),
-    "identification": ("identification", identification, "What is identified of a simulated arm"),
+    "identification": ("identification", identification, "Identification of a simulated arm"),
 }
 
 

@@ -3,9 +3,10 @@
     python benchmarks/robustness.py          # an hour on one core
     python benchmarks/robustness.py --quick  # a few of each part
 
-The part "nasty" has 500 random data sets: no error, no NaN, std > 0. "seeds" has ten random states on the same data:
-the spread of bounds. The CSV also has the parts "jitter" (the noise-free nasty sets with fixed jitters) and "inducing"
-(k-means against greedy inducing points), which are finished; their script stands at commit 36f3be5.
+The part "nasty" fits 500 random data sets. A fit fails if it raises an error, or gives NaN or a standard deviation of
+0. "seeds" fits the same data with ten random states, and measures the spread of the bounds. The CSV also has the
+finished parts "jitter" (the noise-free nasty sets with fixed jitters) and "inducing" (k-means against greedy inducing
+points). Their script is that of commit 36f3be5.
 """
 
 from __future__ import annotations
@@ -210,7 +211,7 @@ def main() -> None:
     options = harness.parse(harness.argument_parser(__doc__, quick="a few fits of each part"))
     output = harness.output_path(options, "robustness")
     n_failures = harness.run_missing(cells_of(options.quick), run, output, options.jobs)
-    title = "Fits of nasty data, and of other random states"
+    title = "Fits to difficult data, and with other random states"
     harness.write_page(title, tables_of(harness.frame(output)), output, n_failures)
 
 

@@ -1,4 +1,4 @@
-"""How long predictions, evaluations of the bound and fits take, and how memory grows with rows.
+"""Time of predictions, evaluations of the bound and fits, and growth of memory with rows.
 
     python benchmarks/speed.py latency     # a row and a horizon of 50 for control loops: a minute
     python benchmarks/speed.py latency --peer-python ../peers/bin/python   # GPflow and GPyTorch as well
@@ -9,23 +9,23 @@
     python benchmarks/speed.py million --fits reference    # a thousand iterations: much longer
     python benchmarks/speed.py checkout --other ../older   # fits by this checkout and by another one, in pairs
 
-With --quick each takes seconds.
+Each part takes seconds with --quick.
 
-*latency*: 100 inducing points, 6 columns, 4 outputs that share them, one thread; medians over half a second. skevgp
-also has groups of one output, and the cartpole with its features.
+*latency* has 100 inducing points, 6 columns and 4 outputs that share the points, on one thread. Times are medians over
+half a second. skevgp also has groups of one output, and the cartpole with its features.
 
-*casadi*: one group of outputs, without features, with IFG and with nominal dynamics. Processor time, the least of
-several rounds. CasADi is called through its buffers and C through ctypes.
+*casadi* has one group of outputs, without features, with IFG and with nominal dynamics. Times are processor time, the
+least of several rounds. CasADi is called through its buffers and C through ctypes.
 
-*evaluation*: the dense products are ``L_inv @ U``, ``V @ V.T``, ``G @ V`` and ``L_inv.T @ (G @ V)`` over all rows.
-Evaluation and products alternate; medians are compared, on one core and on all.
+*evaluation* has the dense products ``L_inv @ U``, ``V @ V.T``, ``G @ V`` and ``L_inv.T @ (G @ V)`` over all rows.
+Evaluation and products alternate. Their medians are compared, on one core and on all.
 
-*rows*: 8 iterations to 8 columns with 100 inducing points, from a memory-mapped file on one and two threads, and by
-Dask on two workers. Memory is the peak above that before the fit.
+*rows* has fits of 8 iterations to 8 columns with 100 inducing points. They read a memory-mapped file on one and two
+threads, or run by Dask on two workers. Memory is the peak above that before the fit.
 
-*million*: L-BFGS with its defaults, natural gradients on mini-batches for some epochs, and L-BFGS with a thousand
-iterations as the reference, of whose gain over noise alone the others have a share. (The reference in the CSV did not
-begin on samples of the rows.)
+*million* has three kinds of fits. These are L-BFGS with its defaults, natural gradients on mini-batches for some
+epochs, and L-BFGS with a thousand iterations, which is the reference. "gained" is the gain over noise alone, as a share
+of that of the reference. The reference in the CSV did not begin on samples of the rows.
 """
 
 from __future__ import annotations
@@ -527,7 +527,7 @@ def checkout_tables(rows: pd.DataFrame) -> harness.Tables:
 
 
 PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables, title
-    "latency": ("latency", latency_cells, run_latency, latency_tables, "What a control loop waits for"),
+    "latency": ("latency", latency_cells, run_latency, latency_tables, "Latency of predictions"),
     "casadi": ("casadi_latency", casadi_cells, run_casadi, casadi_tables, "A prediction by CasADi and in C"),
     "evaluation": (
         "evaluation_cost",
@@ -537,7 +537,7 @@ PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables,
         "One evaluation of the bound and its gradient",
     ),
     "rows": ("scaling", rows_cells, run_rows, rows_tables, "Time and memory over rows"),
-    "million": ("many_rows", million_cells, run_million, million_tables, "1,000,000 rows"),
+    "million": ("many_rows", million_cells, run_million, million_tables, "A fit to 1,000,000 rows"),
     "checkout": ("checkout", checkout_cells, run_checkout, checkout_tables, "This checkout against another"),
 }
 

@@ -1,4 +1,4 @@
-"""Tables of data: other models, and the number of inducing points that n_inducing="auto" finds.
+"""Tables of data: comparison to other models, and the number of inducing points of n_inducing="auto".
 
     python benchmarks/tables.py models      # some hours of one core
     python benchmarks/tables.py models --sets diabetes friedman1-2000 --seeds 1
@@ -6,17 +6,18 @@
     python benchmarks/tables.py inducing --sets toy-200 linear-5 --jobs 2
     python benchmarks/tables.py models --quick  # two small sets, one seed
 
-*models*: EVGPRegressor, scikit-learn's exact Gaussian process, gradient boosting and Bayesian ridge regression, by
-RMSE, NLPD, CRPS, coverage of 90 % intervals and time, on scikit-learn's own sets and on made ones. "boxes" and "houses"
-are as trees like them; the latter is a set like California's houses, with prices that jump between districts. All
-models have their defaults, and see columns and targets of variance one. Models of a set and seed are fitted one after
-the other in one process with one thread, so that ratios of times are of the same run. Also fills the tables of
-docs/guide/boosting.md.
+*models* compares EVGPRegressor, scikit-learn's exact Gaussian process, gradient boosting and Bayesian ridge regression.
+It measures RMSE, NLPD, CRPS, coverage of 90 % intervals and time, on scikit-learn's own sets and on simulated ones.
+"boxes" and "houses" are functions with jumps, which suit trees. "houses" is similar to California's houses, with prices
+that jump between districts. All models have their defaults, and columns and targets have variance one. Models of a set
+and seed are fitted one after the other in one process with one thread, so that ratios of times are of the same run.
+This part also fills the tables of docs/guide/boosting.md.
 
-*inducing*: on twenty sets of at most 3,000 rows, which were chosen before any of them was run, the held-out NLPD of
-``n_inducing="auto"`` against that of the exact `EGPRegressor` with its own kernel. The number of points is compared
-with the smallest of a grid (10, 15, 23, 34, ...) whose fit comes within 0.02 nats per row of the exact one. The default
-of 100 points is there too. Is the upper bound above the exact log marginal likelihood at the same parameters?
+*inducing* compares the held-out NLPD of ``n_inducing="auto"`` to that of the exact `EGPRegressor` with its own kernel.
+There are twenty sets of at most 3,000 rows, which were chosen before any of them was run. The number of points is
+compared with the smallest of a grid (10, 15, 23, 34, ...) whose fit is within 0.02 nats per row of the exact one. The
+default of 100 points is also measured. Another column tests whether the upper bound is above the exact log marginal
+likelihood at the same parameters.
 """
 
 from __future__ import annotations
@@ -435,7 +436,7 @@ def tables_of_inducing(rows: pd.DataFrame) -> harness.Tables:
     covered = sparse["upper"] >= sparse["likelihood"] - 1e-6 * sparse["likelihood"].abs()
     counts = {
         f"sets within {ENOUGH} nats per row of the exact model": lost <= ENOUGH,
-        "sets with at most twice the smallest number of the grid that is": ratio <= 2.0,
+        "sets where auto's m is at most twice the smallest m": ratio <= 2.0,
         "fits whose upper bound covers the exact log marginal likelihood": covered,
     }
     lines = [(name, f"{held.sum()} of {len(held)}") for name, held in counts.items()]
@@ -467,7 +468,7 @@ def main() -> None:
         fits = [Fit(name, seed, model) for seed in options.seeds for model in FITS for name in names]
         n_failures = harness.run_missing(fits, run_inducing, output, options.jobs)
         tables = tables_of_inducing(harness.frame(output))
-        harness.write_page("Inducing points that are chosen", tables, output, n_failures)
+        harness.write_page("Automatic number of inducing points", tables, output, n_failures)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ random state 1000.
     python benchmarks/paper/figure6.py --systems pendulum --settings paper skevgp-angles
     python benchmarks/paper/figure6.py --systems iiwa14 --max-iter 60  # of each GP
 
-The settings are those of table4.py. Of "skevgp-nominal" there is EVGP-IFG on iiwa14. In skevgp's settings a run takes
+The settings are those of table4.py. "skevgp-nominal" has only EVGP-IFG on iiwa14. In skevgp's settings a run takes
 20 seconds of one core for the pendulum, 3 minutes for the cartpole, 12 for the acrobot and 3 hours for iiwa14.
 """
 

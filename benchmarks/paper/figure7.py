@@ -1,4 +1,4 @@
-"""The paper's Figure 7: what the weights of the physics features have learned.
+"""The paper's Figure 7: the learned weights of the physics features.
 
 The CSV has a row per weight: its prior, its posterior and its least squares estimate. In the paper, the weights of
 positions on velocities of the acrobot turn negative without features of gravity, to imitate it.

@@ -1,7 +1,7 @@
 """The paper's Table 3: time and space against inducing points, rows, outputs and units.
 
-Measures evaluations of the bound with its gradient, steps of Adam in the paper's setting, steps of the network, and the
-size of fitted models. Exponents of power laws are fitted to the CSV.
+The script measures evaluations of the bound with its gradient, steps of Adam in the paper's setting, steps of the
+network, and the size of fitted models. Exponents of power laws are fitted to the CSV.
 
     python benchmarks/paper/table3.py                    # two minutes of an idle core
     python benchmarks/paper/table3.py --quick            # few sizes, seconds
@@ -174,7 +174,7 @@ def table_of(curves: list[Curve], data: pd.DataFrame) -> pd.DataFrame:
         points = points_of(curve, data)
         fitted, low, high = (f"{round(value, 2) + 0.0:.2f}" for value in exponents(curve, points))
         unit, scale = {"seconds": (" s", 1.0), "n_bytes": (" MB", 1e-6), "n_parameters": ("", 1.0)}[curve.value]
-        line = {"what": curve.name, "against": LABELS[curve.varied], "paper's exponent": curve.paper}
+        line = {"quantity": curve.name, "against": LABELS[curve.varied], "paper's exponent": curve.paper}
         line["ours (between neighbours)"] = f"{fitted} ({low} to {high})"
         line["fitted to"] = f"{max(points.index[0], curve.above):g} to {points.index[-1]:g}"
         line["smallest to largest"] = " to ".join(map(figure_of, scale * points.iloc[[0, -1]])) + unit

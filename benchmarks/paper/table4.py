@@ -1,4 +1,4 @@
-"""The paper's Table 4: the test results of every system and model, beside the paper's numbers.
+"""The paper's Table 4: the test results of every system and model, next to the paper's numbers.
 
 A model of seed s learns from data of random state s and is tested on 1000 + s.
 
@@ -11,13 +11,17 @@ A model of seed s learns from data of random state s and is tested on 1000 + s.
 There are two cartpoles. ``cartpole_damped`` has damping on both joints, as Drake's had in Python when the paper was
 written. Angles are raw, or wrapped to [-pi, pi) in the inputs, with the targets moved along.
 
-Settings: "paper" (Adam, diagonal posterior, inducing points per output), "author" and "author-100" (the solver and the
-starts of the author's library, with a prior scale of 1 or 100), "skevgp" (defaults), "skevgp-angles" (the kernel sees
-sines and cosines of angles) and, for EVGP on iiwa14, "skevgp-nominal" (further features from a model of the arm whose
-inertial parameters are wrong by up to 20 %).
+The settings are:
 
-With Adam a fit takes up to 5 minutes of one core for the pendulum and the cartpole, 2 to 16 for the acrobot, and 2 to 3
-hours for iiwa14. In the other settings it takes seconds to minutes, for iiwa14 up to an hour.
+- "paper": Adam, diagonal posterior, inducing points per output;
+- "author" and "author-100": the solver and the starts of the author's library, with a prior scale of 1 or 100;
+- "skevgp": defaults;
+- "skevgp-angles": the kernel gets sines and cosines of angles;
+- "skevgp-nominal", for EVGP on iiwa14: further features from a model of the arm whose inertial parameters are wrong by
+  up to 20 %.
+
+With Adam a fit takes up to 5 minutes of one core for the pendulum and the cartpole, and 2 to 16 for the acrobot. For
+iiwa14 it takes 2 to 3 hours. In the other settings it takes seconds to minutes, for iiwa14 up to an hour.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Each library as a peer: how it fits a job, and what it says of a model at fixed hyperparameters.
+"""Each library as a peer: its fit of a job, and its bound and predictions at fixed hyperparameters.
 
-`against_peers.py` runs a peer in a process of its own, because the libraries need different versions of NumPy. So
-nothing but NumPy is imported here until a peer asks for it. Jobs and results are .npz files.
+`against_peers.py` runs each peer in a separate process, because the libraries need different versions of NumPy. So this
+module imports only NumPy until a peer needs more. Jobs and results are .npz files.
 
     python benchmarks/peers/adapters.py "GPflow SGPR" job.npz result.npz
 

@@ -1,18 +1,18 @@
 """EVGPRegressor against scikit-learn's GaussianProcessRegressor as the number of rows grows.
 
-Time, memory, error and NLPD of fits to the first N rows, in random order, of a data set: of the paper's pendulum and
-cartpole (the change of the state is learned; no noise) and of a smooth function of 8 columns with noise. Each fit has a
-process of its own and one thread.
+The script measures time, memory, error and NLPD of fits to the first N rows of a data set, in random order. Data sets
+are the paper's pendulum and cartpole without noise, where models learn the change of the state, and a smooth function
+of 8 columns with noise. Each fit runs in a separate process on one thread.
 
     python benchmarks/peers/against_gpr.py          # half an hour to an hour of one core
     python benchmarks/peers/against_gpr.py --quick  # 50 and 150 rows: under a minute
     python benchmarks/peers/against_gpr.py --systems smooth --time-limit 1500  # an exact fit to more rows
 
-Models without features: "GPR" is scikit-learn's, with ConstantKernel * RBF (a lengthscale per column) + WhiteKernel,
-``normalize_y=True`` and its own optimizer; all columns of y share kernel and noise. "EGP" and "EVGP" (100 inducing
-points) are skevgp's with their defaults. The CSV also has the exact counterpart of each EVGP: GPR with the EVGP's
-kernel and noise, without an optimizer. With gravity's features there are "EGP-IFG" and "EVGP-IFG" (the paper's 10 or 60
-inducing points). A fit is left out if, judged by smaller ones, it would take longer than --time-limit.
+Without features, "GPR" is scikit-learn's model, with ConstantKernel * RBF (a lengthscale per column) + WhiteKernel. It
+has ``normalize_y=True`` and its own optimizer, and all columns of y share kernel and noise. "EGP" and "EVGP" (100
+inducing points) are skevgp's with their defaults. The CSV also has the exact counterpart of each EVGP: GPR with the
+EVGP's kernel and noise, without an optimizer. With gravity's features there are "EGP-IFG" and "EVGP-IFG" (the paper's
+10 or 60 inducing points). A fit is left out if it would take longer than --time-limit, estimated from smaller ones.
 """
 
 from __future__ import annotations

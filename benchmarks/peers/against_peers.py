@@ -1,9 +1,9 @@
 """skevgp against other libraries: same data, same number of inducing points, same kernel, same start.
 
 First every library has to agree with dense matrices at fixed hyperparameters. Then each fit is a row of a CSV, and its
-bound, RMSE and NLPD over time are in a second CSV; what is deleted from both is measured again. Peers that are not
-installed are left out. GPflow needs another NumPy than skevgp and GPJax: give the interpreter that has the peers (see
-requirements.txt and requirements_jax.txt).
+bound, RMSE and NLPD over time are in a second CSV. Rows that are deleted from both are measured again. Peers that are
+not installed are left out. GPflow needs another NumPy than skevgp and GPJax. So pass the interpreter that has the peers
+(see requirements.txt and requirements_jax.txt).
 
     python benchmarks/peers/against_peers.py --peer-python .peers/bin/python --data-folder ../uci
     python benchmarks/peers/against_peers.py --peers "GPJax SGPR" --peer-python .peers_jax/bin/python
@@ -16,13 +16,13 @@ All ten splits of the tables, with GPflow's SGPR, gradient boosting, a straight 
 
 The tables airfoil, elevators and kin40k are read from --data-folder: NAME/data.csv.gz with the target last, and
 NAME/test_mask.csv.gz with a column per split. A seed is a split. Tables and "smooth", 10,000 rows of waves of 8 columns
-with noise, are standardised with the training rows. Of systems the change of the state is learned.
+with noise, are standardised with the training rows. On systems, models learn the change of the state.
 
-The kernel is a squared exponential with a lengthscale per column; the prior mean is 0. skevgp has its defaults. The
-noise of the others starts at the whole variance, of systems at a hundredth. They have 120 iterations of L-BFGS (GPflow,
-GPJax; of the acrobot 200), 300 steps of Adam (GPyTorch), or an exact GP on 1,500 rows. Each fit has a process of its
-own on two cores. The clock starts with the arrays in memory and the libraries imported, so that TensorFlow's tracing
-and JAX's compilation are part of a fit.
+The kernel is a squared exponential with a lengthscale per column, and the prior mean is 0. skevgp has its defaults. The
+noise of the others starts at the whole variance of the targets, and on systems at a hundredth of it. They have 120
+iterations of L-BFGS (GPflow, GPJax; on the acrobot 200), 300 steps of Adam (GPyTorch), or an exact GP on 1,500 rows.
+Each fit runs in a separate process on two cores. The clock starts with the arrays in memory and the libraries imported,
+so that TensorFlow's tracing and JAX's compilation are part of a fit.
 """
 
 from __future__ import annotations

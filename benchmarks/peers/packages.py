@@ -1,8 +1,8 @@
-"""The size of Gaussian process packages: what pip installs with each, in MB, and how much code it is.
+"""The size of Gaussian process packages: MB that pip installs with each, and lines of code.
 
-Each package is installed by pip, alone, in an empty environment; the CSV has one row per package. Code is counted in
-lines of the package's own Python files that hold code (tests left out): no comments, no docstrings, no blank lines.
-On Linux pip takes the torch of the default index, which brings CUDA.
+Each package is installed by pip, alone, in an empty environment. The CSV has one row per package. Lines of code are
+those of the package's own Python files without tests, comments, docstrings and blank lines. On Linux, pip takes the
+torch of the default index, which brings CUDA.
 
     python benchmarks/peers/packages.py
 """
