@@ -146,6 +146,7 @@ for name in names:
     ax.plot(seconds, np.abs(mean - test.target[move, output]), color=colours[name], label=name)
     ax.plot(seconds, 2 * std, color=colours[name], linestyle=":", label=f"{name}: 2 std")
 ax.set_yscale("log")
+ax.yaxis.set_major_formatter("{x:g}")
 ax.set_ylim(top=20 * ax.get_ylim()[1])  # room for the legend
 ax.set_xlabel("time (s)")
 ax.set_ylabel(f"|error| of {test.target_names[output]} (rad/s)")
@@ -161,7 +162,7 @@ ax.set_ylim(bottom=-2.0)  # room for the legend
 ax.set_xlabel("weight for the joint's velocity, divided by Δt")
 ax.set_title("Weights of the nominal accelerations")
 
-for ax, place in zip(axes.flat, ("upper right", "lower right", "upper left", "lower center"), strict=True):
+for ax, place in zip(axes.flat, ("best", "lower right", "upper left", "lower center"), strict=True):
     ax.legend(loc=place, ncols=2 if ax is axes[1, 0] else 1)
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "nominal_dynamics.png"

@@ -197,7 +197,7 @@ def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
         "Time with more outputs or layers": ("n_outputs", "n_layers"),
         "Space of wider models": ("n_inducing", "n_units"),
     }
-    figure, grid = harness.pyplot().subplots(2, 2, figsize=(harness.WIDTH, 7.6))
+    figure, grid = harness.pyplot().subplots(2, 2, figsize=(harness.WIDTH, 7.0))
     for axes, (title, varied) in zip(grid.flat, panels.items(), strict=True):
         value, label, scale = "seconds", "time (ms)", 1e3
         if title.startswith("Space"):
