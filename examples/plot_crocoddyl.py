@@ -232,9 +232,7 @@ bottom_left.set_ylim(1e-9, 10.0)  # room for the legend
 
 for own, label, colour in ((first_log, f"{n_first} steps", "#009E73"), (log, f"all {task.n_steps}", "#CC79A7")):
     bottom_right.plot(own.costs, ".-", color=colour, label=label)
-bottom_right.set(
-    title="Costs of FDDP: motions with gaps are cheap", xlabel="iteration", ylabel="cost", yscale="log"
-)
+bottom_right.set(title="Costs of FDDP: motions with gaps are cheap", xlabel="iteration", ylabel="cost", yscale="log")
 for ax in (top_left, top_right, bottom_left, bottom_right):
     ax.legend()
 figure.suptitle(f"Crocoddyl's FDDP on EVGP-IFG, learned from {seconds:g} s of data")
