@@ -121,6 +121,7 @@ ax = axes[0, 0]
 for name, marker in zip(names, "so", strict=True):
     ax.loglog(sizes, results[name], marker=marker, color=colours[name], label=name)
 ax.axhline(untrained_error, color="0.4", linestyle="--", label="wrong model, no data")
+ax.set_ylim(top=5 * ax.get_ylim()[1])  # room for the legend
 ax.set_xticks(sizes, sizes)
 ax.minorticks_off()
 ax.set_xlabel("training moves of 50 steps")
@@ -162,7 +163,7 @@ ax.set_ylim(bottom=-2.0)  # room for the legend
 ax.set_xlabel("weight for the joint's velocity, divided by Δt")
 ax.set_title("Weights of the nominal accelerations")
 
-for ax, place in zip(axes.flat, ("best", "lower right", "upper left", "lower center"), strict=True):
+for ax, place in zip(axes.flat, ("upper right", "lower right", "upper left", "lower center"), strict=True):
     ax.legend(loc=place, ncols=2 if ax is axes[1, 0] else 1)
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "nominal_dynamics.png"
