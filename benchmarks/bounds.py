@@ -147,7 +147,7 @@ def draw(output: Path, n_rows: int, sizes: tuple[int, ...]) -> None:
     """Draw both bounds, the exact log likelihood and the noise over the number of inducing points of a toy set."""
     X, y = make_toy(n_rows, random_state=0, return_X_y=True)
     exact = EGPRegressor(random_state=0).fit(X, y)
-    figure, (left, right) = harness.pyplot().subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
+    figure, (left, right) = harness.pyplot().subplots(1, 2, figsize=(harness.WIDTH, 3.4), layout="constrained")
     for bound, style in (("titsias", "o-"), ("tight", "s-")):
         solver = LBFGS(bound=bound, n_restarts=4)
         with harness.one_thread():

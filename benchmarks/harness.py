@@ -256,8 +256,7 @@ def logarithmic(axes: Any, which: str = "y") -> None:
     axis = axes.xaxis if which == "x" else axes.yaxis
     low, high = np.log10(axis.get_view_interval())
     axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high - low < (2.0 if which == "x" else 3.0) else (1,)))
-    if low > -5.0 and high < 6.5:
-        axis.set_major_formatter(lambda value, _: f"{value:,g}")
+    axis.set_major_formatter(lambda value, _: f"{value:,g}" if value < 1e7 else f"{value:g}")
     axis.set_minor_formatter(ticker.NullFormatter())
 
 
@@ -269,13 +268,13 @@ def legend(figure: Any, **options: Any) -> None:
 
 
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure as a PNG of at most 256 colours, which halves its size, and close it."""
+    """Write a figure as a PNG of at most 128 colours, which halves its size, and close it."""
     from PIL import Image
 
     figure.set_dpi(pyplot().rcParams["savefig.dpi"])
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-    image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
     pyplot().close(figure)
 
 

@@ -111,6 +111,16 @@ MODELS = (
     "random forest",
 )
 
+# What pictures call the models of the CSV and of the tables.
+TODAY = {
+    "CAD": "URDF",
+    "least squares, prior": "InverseDynamics without GP",
+    "GP": "GP without physics",
+    EVGP: "InverseDynamics",
+}
+# In two colours: an arm's first split, and its others.
+SHARES = ("all training data", "less: one of three logs, or two thirds of one")
+
 Real = namedtuple("Real", "robot split model size")
 
 # The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+".
@@ -383,32 +393,42 @@ def friction_of(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def plot_real(rows: pd.DataFrame, path: Path) -> None:
-    """Draw ratios of each joint and test file, and shares within two standard deviations, a panel per split."""
-    present = zip(rows["robot"], rows["split"], strict=True)
-    splits = ordered([(robot, split) for robot in SPLITS for split in SPLITS[robot]], present)
-    size = (harness.WIDTH, 0.9 + 1.7 * len(splits))
-    figure, axes = harness.pyplot().subplots(len(splits), 2, figsize=size, sharex="col", squeeze=False)
-    for (ratios, shares), (robot, split) in zip(axes, splits, strict=True):
-        own = rows[(rows["robot"] == robot) & (rows["split"] == split)]
-        names = [model for model in MODELS if (own["model"] == model).any()]
-        banded = [model for model in names if own.loc[own["model"] == model, "cr2"].notna().all()]
-        names.remove(LEAST_SQUARES)
-        for panel, models in ((ratios, names), (shares, banded)):
-            for place, model in enumerate(models):
-                mine = own[own["model"] == model]
-                values = mine["ratio"]
-                if panel is shares:
-                    values = [pooled(part, "cr2") for _, part in mine.groupby("joint")]
-                color = harness.PALETTE[model == EVGP]
-                panel.plot(values, place + np.linspace(-0.25, 0.25, len(values)), ".", color=color, alpha=0.6)
-            panel.set(yticks=range(len(models)), yticklabels=models, ylim=(len(models) - 0.5, -0.5))
+    """Draw ratios and shares within two standard deviations: a row of panels per arm, its splits in two colours."""
+    robots = ordered(SPLITS, rows["robot"])
+    size = (harness.WIDTH, 1.2 + 2.9 * len(robots))
+    figure, axes = harness.pyplot().subplots(
+        len(robots), 2, figsize=size, sharex="col", sharey="row", squeeze=False, width_ratios=(1.4, 1.0)
+    )
+    for (ratios, shares), robot in zip(axes, robots, strict=True):
+        of_robot = rows[rows["robot"] == robot]
+        names = [model for model in MODELS if (of_robot["model"] == model).any()]
+        first = next(iter(SPLITS[robot]))
+        for number, part in enumerate((of_robot["split"] == first, of_robot["split"] != first)):
+            color, label = harness.PALETTE[number], SHARES[number]
+            for place, model in enumerate(names):
+                own = of_robot[part & (of_robot["model"] == model)]
+                if own.empty:
+                    continue
+                height = place + 0.4 * (number - 0.5)
+                errors = own["ratio"] if model != LEAST_SQUARES else own["ratio"][:0]
+                bands = own[own["cr2"].notna()].groupby(["split", "joint"])[["cr2", "n_test"]]
+                inside = pd.Series([pooled(joint, "cr2") for _, joint in bands], dtype=float)
+                for panel, values, mean in ((ratios, errors, geometric), (shares, inside, np.mean)):
+                    if len(values):
+                        panel.plot(values, [height] * len(values), ".", color=color, alpha=0.3, markersize=5)
+                        known = label in panel.get_legend_handles_labels()[1]
+                        shown = None if known or panel is shares else label
+                        panel.plot(mean(values), height, "so"[number], color=color, markeredgecolor="w", label=shown)
+        ratios.set(yticks=range(len(names)), yticklabels=[TODAY.get(name, name) for name in names])
+        ratios.set_ylim(len(names) - 0.5, -0.5)
         ratios.axvline(1.0, color="0.5", linewidth=0.8)
-        ratios.set_xscale("log")
+        ratios.set_title(robot.upper().replace("E", "e"), loc="left")
         shares.axvspan(0.9, 0.99, color="0.9", zorder=0)
         shares.axvline(0.954, color="0.5", linewidth=0.8)
-        ratios.set_title(f"{robot}, trained on {split}", loc="left")
-    axes[-1, 0].set_xlabel("error / least squares'\n(each file and joint)")
-    axes[-1, 1].set_xlabel("share of rows within ± 2 std\n(each joint; gray: 90 to 99 %)")
+    harness.logarithmic(axes[0, 0], "x")
+    axes[-1, 0].set_xlabel("mean square error / least squares'")
+    axes[-1, 1].set_xlabel("share of rows within ± 2 std")
+    harness.legend(figure, ncols=2, title="trained on")
     harness.save_picture(figure, path)
 
 

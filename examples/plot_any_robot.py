@@ -135,8 +135,8 @@ for row, joint in zip(axes, joints.tolist(), strict=True):
         ax.set_title(f"{robot.names[joint + 1]}: {name}")
     row[1].sharey(row[0])
     unit = "rad/s" if layout_of(robot).revolute[joint] else "m/s"
-    row[0].set_ylabel(f"change of velocity in {moves.dt} s ({unit})")
-axes[0, 0].legend()
+    row[0].set_ylabel(f"change in {moves.dt} s ({unit})")
+figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 for ax in axes[-1]:
     ax.set_xlabel("time (s)")
 

@@ -14,8 +14,6 @@ the meaning of a parameter if the simulator is wrong.
 # rows of angle, velocity and torque. Its friction is viscous, and dry with a Stribeck effect: it is larger at low
 # speed.
 
-import os
-
 import autograd.numpy as np
 import matplotlib.pyplot as plt
 from sklearn.preprocessing import FunctionTransformer
@@ -24,7 +22,6 @@ from skevgp import CoefPrior, EVGPRegressor
 from skevgp.features import LogNormal, Normal, ParametricFeatures
 
 plt.style.use("skevgp.plotting.page")
-quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 STEP = 0.03  # s
 
 
@@ -48,7 +45,7 @@ def change(X, ripple=0.0, **theta):
 
 true = {"length": 0.5, "damping": 0.1, "coulomb": 0.2, "stribeck_velocity": 0.5}
 rng = np.random.default_rng(1)
-X, X_test = (rng.uniform(-1.0, 1.0, (n, 3)) * [np.pi, 6.0, 4.0] for n in (150 if quick else 400, 2000))
+X, X_test = (rng.uniform(-1.0, 1.0, (n, 3)) * [np.pi, 6.0, 4.0] for n in (400, 2000))
 y, y_test = (change(rows, ripple=0.2, **true) for rows in (X, X_test))
 y = y + 0.01 * np.std(y) * rng.standard_normal(len(y))
 
@@ -61,7 +58,7 @@ y = y + 0.01 * np.std(y) * rng.standard_normal(len(y))
 priors = {name: LogNormal(1.2 * value, 0.4) for name, value in true.items()}
 units = {"length": "m", "damping": "N m s/rad", "coulomb": "N m", "stribeck_velocity": "rad/s"}
 as_it_is = CoefPrior(mean=1.0, scale=0.0)
-options = {"coef_prior": as_it_is, "n_inducing": 30 if quick else 60, "random_state": 0}
+options = {"coef_prior": as_it_is, "n_inducing": 60, "random_state": 0}
 learned = EVGPRegressor(ParametricFeatures(change, priors, units), **options).fit(X, y)
 print(learned.summary())
 

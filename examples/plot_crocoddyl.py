@@ -226,14 +226,13 @@ top_right.set(title="What the motor does", xlabel="time (s)", ylabel=push)
 low, middle, high = np.quantile(np.abs(ahead.samples[..., pole] - Z[1:, pole]), (0.05, 0.5, 0.95), axis=0)
 bottom_left.fill_between(times[1:], low, high, color="0.85", zorder=0, label="particles, with the gains: 5 to 95 %")
 bottom_left.plot(times[1:], middle, color="0.5", linestyle=":", zorder=0, label="and their median")
-bottom_left.set(title="How far the pole is off the plan", xlabel="time (s)", ylabel="rad", yscale="log")
-bottom_left.set_ylim(1e-6, 10.0)
+bottom_left.set(title="How far the pole is off the plan", xlabel="time (s)", ylabel="angle (rad)", yscale="log")
+bottom_left.yaxis.set_major_formatter("{x:g}")
+bottom_left.set_ylim(1e-9, 10.0)  # room for the legend
 
 for own, label, colour in ((first_log, f"{n_first} steps", "#009E73"), (log, f"all {task.n_steps}", "#CC79A7")):
     bottom_right.plot(own.costs, ".-", color=colour, label=label)
-bottom_right.set(
-    title="FDDP: motions with gaps are cheap, until these close", xlabel="iteration", ylabel="cost", yscale="log"
-)
+bottom_right.set(title="Costs of FDDP: motions with gaps are cheap", xlabel="iteration", ylabel="cost", yscale="log")
 for ax in (top_left, top_right, bottom_left, bottom_right):
     ax.legend()
 figure.suptitle(f"Crocoddyl's FDDP on EVGP-IFG, learned from {seconds:g} s of data")

@@ -159,8 +159,10 @@ for name, colour in colours.items():
 axes[0, 0].plot(seconds, truth, "k--", linewidth=1, label="truth")
 axes[0, 0].set(title="One-step predictions along a test trajectory, ±2 std", ylabel=velocity)
 axes[1, 0].set(title="Errors and standard deviations", ylabel=velocity, yscale="log", xlabel="time (s)")
-for ax in axes[:, 0]:
-    ax.legend(loc="upper left")
+axes[1, 0].yaxis.set_major_formatter("{x:g}")
+axes[0, 0].legend()
+axes[1, 0].set_ylim(top=200 * axes[1, 0].get_ylim()[1])  # room for the legend
+axes[1, 0].legend(loc="upper left", ncols=2)
 for ax, state in zip(axes[:, 1], range(n_states - 2, n_states), strict=True):
     CoefficientDisplay.from_estimator(models["EVGP-IFG"], output=state, ax=ax)
     ax.set(title=f"EVGP-IFG: weights of the next {test.target_names[state]}", xlabel="weight (SI units)")

@@ -121,6 +121,7 @@ ax = axes[0, 0]
 for name, marker in zip(names, "so", strict=True):
     ax.loglog(sizes, results[name], marker=marker, color=colours[name], label=name)
 ax.axhline(untrained_error, color="0.4", linestyle="--", label="wrong model, no data")
+ax.set_ylim(top=5 * ax.get_ylim()[1])  # room for the legend
 ax.set_xticks(sizes, sizes)
 ax.minorticks_off()
 ax.set_xlabel("training moves of 50 steps")
@@ -146,6 +147,7 @@ for name in names:
     ax.plot(seconds, np.abs(mean - test.target[move, output]), color=colours[name], label=name)
     ax.plot(seconds, 2 * std, color=colours[name], linestyle=":", label=f"{name}: 2 std")
 ax.set_yscale("log")
+ax.yaxis.set_major_formatter("{x:g}")
 ax.set_ylim(top=20 * ax.get_ylim()[1])  # room for the legend
 ax.set_xlabel("time (s)")
 ax.set_ylabel(f"|error| of {test.target_names[output]} (rad/s)")

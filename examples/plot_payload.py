@@ -186,7 +186,7 @@ for axis, colour in enumerate(colours):
         axes[1].axhline(1e3 * com[axis], color=colour, linewidth=1)
 axes[1].set_ylabel("centre of mass (mm)")
 axes[1].set_title("gain_scale=0.1" + (", and the truth as lines" if com else ""))
-axes[1].set_xlabel("seconds of log with the load")
+axes[1].set_xlabel("length of the log with the load (s)")
 axes[1].sharex(axes[0])
 for (factor, (load, deviation)), colour in zip(followed.items(), colours, strict=False):
     axes[2].plot(times, load, color=colour, label=f"forgetting_factor={factor:g}")

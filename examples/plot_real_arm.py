@@ -92,8 +92,8 @@ print(f"{robot.name}, {'simulated' if truth else 'its logs'}: {len(train.data)} 
 
 options.output.mkdir(parents=True, exist_ok=True)
 stem = "real_arm" if options.data is None else "real_arm_measured"
-shown = [1, 2, 4]
-SignalsDisplay.from_log(train, joints=shown).figure_.savefig(options.output / f"{stem}_signals.png")
+elbow = 2
+SignalsDisplay.from_log(train, joints=[elbow]).figure_.savefig(options.output / f"{stem}_signals.png")
 
 # %%
 # Predict torques in three ways
@@ -156,57 +156,46 @@ for name, row in asked.items():
 # Plot torques, errors and parameters
 # -----------------------------------
 # The URDF alone has gravity, but no friction. The interval is two standard deviations of InverseDynamics on each side
-# of its mean.
+# of its mean. The other intervals hold 95 %.
 
-figure, axes = plt.subplots(3, 2, figsize=(8, 6.8), width_ratios=(1.3, 1))
+figure, ((of_torque, of_errors), (of_masses, of_friction)) = plt.subplots(2, 2, figsize=(8, 6.2))
 colours = {"URDF": "#D55E00", "least squares": "#999999", "InverseDynamics": "#0072B2"}
 window = slice(0, 1000)
 # No line reaches across a gap or rest: one row less there.
 seconds = np.where(np.diff(new.pieces, prepend=new.pieces[0]) == 0, new.time, np.nan)[window]
-for ax, joint in zip(axes[:, 0], shown, strict=True):
-    ax.plot(seconds, predictions["URDF"][window, joint], color=colours["URDF"], linewidth=1, label="URDF")
-    ax.plot(seconds, new.target[window, joint], "k", linewidth=1, label="measured")
-    band = mean[window, joint] + 2.0 * np.array([[-1.0], [1.0]]) * std[window, joint]
-    ax.fill_between(seconds, *band, color=colours["InverseDynamics"], alpha=0.5, linewidth=0)
-    ax.set_title(joints[joint].removesuffix("_joint").replace("_", " "))
-    ax.set_ylabel("torque (N m)")
-axes[2, 0].set_xlabel("time (s)")
+of_torque.plot(seconds, predictions["URDF"][window, elbow], color=colours["URDF"], linewidth=1)
+of_torque.plot(seconds, new.target[window, elbow], "k", linewidth=1, label="measured")
+band = mean[window, elbow] + 2.0 * np.array([[-1.0], [1.0]]) * std[window, elbow]
+of_torque.fill_between(seconds, *band, color=colours["InverseDynamics"], alpha=0.5, linewidth=0)
+of_torque.set(title="The elbow on a new trajectory", xlabel="time (s)", ylabel="torque (N m)")
 
 short = [joint.removesuffix("_joint").replace("_", "\n") for joint in joints]
 places = np.arange(len(joints))
 for (name, error), marker in zip(errors.items(), "s^o", strict=True):
-    axes[0, 1].plot(places, error, marker, color=colours[name], label=name)
-axes[0, 1].set_yscale("log")
-axes[0, 1].grid(axis="y", color="0.9")
-axes[0, 1].set_title("Mean squared error / variance")
-for ax, start, title in (
-    (axes[1, 1], "m(", "Mass of the link (kg)"),
-    (axes[2, 1], "coulomb(", "Coulomb's friction (N m)"),
+    of_errors.plot(places, error, marker, color=colours[name], label=name)
+of_errors.set(title="Errors on the new trajectory", ylabel="mean squared error / variance", yscale="log")
+for ax, start, title, unit in (
+    (of_masses, "m(", "Masses of the links", "mass (kg)"),
+    (of_friction, "coulomb(", "Coulomb's friction", "torque (N m)"),
 ):
     rows = [row for name, row in asked.items() if name.startswith(start)]
     before, after = (
         np.array([interval(row, *of) for row in rows]).T for of in ((cad, prior_cov), (model.coef_, model.coef_cov_))
     )
     if start == "m(":
-        ax.errorbar(places - 0.22, *before, fmt="s", color=colours["URDF"], capsize=3, label="URDF, prior")
-    ax.errorbar(
-        places + 0.22 * (start == "m("),
-        *after,
-        fmt="o",
-        color=colours["InverseDynamics"],
-        capsize=3,
-        label="found, 95 %",
-    )
+        ax.errorbar(places - 0.22, *before, fmt="s", color=colours["URDF"], capsize=3)
+    shift = 0.22 * (start == "m(")
+    ax.errorbar(places + shift, *after, fmt="o", color=colours["InverseDynamics"], capsize=3)
     if truth and start == "m(":
         ax.plot(places, [row @ true_weights for row in rows], "kx", label="truth")
-    ax.set_title(title)
+    ax.set(title=title, ylabel=unit)
     ax.set_ylim(bottom=0.0)
-for ax in axes[:, 1]:
-    ax.set_xticks(places, short, fontsize=7)
+for ax in (of_errors, of_masses, of_friction):
+    ax.set_xticks(places, short)
     ax.set_xlim(-0.5, len(joints) - 0.5)
-axes[1, 1].legend()
-handles = [*axes[0, 0].get_lines()[1:], *axes[0, 1].get_lines()]
-figure.legend(handles, [line.get_label() for line in handles], loc="outside lower center", ncols=4)
+handles = [*of_torque.get_lines()[1:], *of_errors.get_lines(), *of_masses.get_lines()[-1:]]
+handles = [handle for handle in handles if not handle.get_label().startswith("_")]
+figure.legend(handles, [handle.get_label() for handle in handles], loc="outside lower center", ncols=5)
 
 picture = options.output / f"{stem}.png"
 figure.savefig(picture)

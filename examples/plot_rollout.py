@@ -91,14 +91,15 @@ except ValueError as error:
 # %%
 # Plot trajectories and errors
 # ----------------------------
-# The upper row shows a test trajectory of each system, the one with the largest standard deviation at the end. The
-# lower row shows medians over all trajectories. Errors grow hundreds of times within a second, and so do the standard
-# deviations.
+# The upper row shows a trajectory of the cartpole and one of the acrobot, those with the largest standard deviation
+# at the end. The lower row is of all test trajectories and all systems. Errors of the angles grow hundreds of times
+# within a second, and so do the standard deviations. The dotted line is the share that should be within two of them.
 
-figure, axes = plt.subplots(2, len(SYSTEMS), figsize=(8, 5.1), sharex=True)
+figure, axes = plt.subplots(2, 2, figsize=(8, 6), sharex=True)
 times = train.dt * np.arange(1, n_steps + 1)
-for (upper, lower), (system, (_, n_trajectories, state, name)) in zip(axes.T, SYSTEMS.items(), strict=True):
+for ax, system in zip(axes[0], ("cartpole", "acrobot"), strict=True):
     ahead, truth = rollouts[system], truths[system]
+    _, n_trajectories, state, name = SYSTEMS[system]
     index = int(np.argmax(ahead.std[:, -1, state]))
     RolloutDisplay.from_rollout(
         ahead,
@@ -107,22 +108,26 @@ for (upper, lower), (system, (_, n_trajectories, state, name)) in zip(axes.T, SY
         state_names=[name] * truth.shape[2],
         dt=train.dt,
         index=index,
-        axes=upper,
+        axes=ax,
     )
-    upper.set_xlabel("")
-    upper.set_title(f"{system}, learned from {n_trajectories} × 3 s:\nthe least sure of {n_test} trajectories")
+    ax.set_xlabel("")
+    ax.set_title(f"{system}, learned from {n_trajectories} × 3 s:\nthe least sure of {n_test} trajectories")
+axes[0, 0].legend()
+growth, share = axes[1]
+for (system, (_, _, state, _)), colour in zip(SYSTEMS.items(), ("#009E73", "#CC79A7", "#E69F00"), strict=True):
+    ahead, truth = rollouts[system], truths[system]
     errors = np.abs(ahead.mean - truth)[:, :, state]
-    lower.plot(times, np.median(errors, axis=0), color="#D55E00", linestyle="--", label="|error|, median")
-    lower.plot(times, np.median(ahead.std[:, :, state], axis=0), color="#0072B2", label="std, median")
-    lower.set_yscale("log")
-    lower.set_xlabel("time (s)")
-    lower.set_ylabel(name)
-    lower.set_title(f"all {n_test}: {coverage[system].mean():.0%} within 2 std")
-known = [ax.get_legend_handles_labels() for ax in axes[:, 0]]
-figure.legend(*(above + below for above, below in zip(*known, strict=True)), loc="outside lower center", ncols=6)
-limits = np.array([ax.get_ylim() for ax in axes[1]])
-for ax in axes[1]:
-    ax.set_ylim(limits.min(), limits.max())
+    growth.plot(times, np.median(errors, axis=0), color=colour, linestyle="--")
+    growth.plot(times, np.median(ahead.std[:, :, state], axis=0), color=colour)
+    share.plot(times, coverage[system], color=colour, label=f"{system}: {coverage[system].mean():.0%}")
+growth.plot([], [], "k", label="std")
+growth.plot([], [], "k--", label="|error|")
+growth.set(title=f"Medians of {n_test} trajectories", xlabel="time (s)", ylabel="angle (rad)", yscale="log")
+share.axhline(0.954, color="k", linestyle=":", linewidth=1)
+share.set(title="True states within 2 std", xlabel="time (s)", ylabel="share of states", ylim=(0.0, 1.05))
+growth.yaxis.set_major_formatter("{x:g}")
+growth.legend(loc="lower right")
+share.legend(loc="lower right")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "rollout.png"

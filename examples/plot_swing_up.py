@@ -84,8 +84,9 @@ except ValueError as error:
 # %%
 # Plot the swing-up, the plans and the errors
 # -------------------------------------------
-# Each plan starts at a true state. If a thin line leaves the thick one, the model was wrong or the plan changed. The
-# side on which the pole comes up is random. One step ahead, most errors should be below two standard deviations.
+# Each plan starts at a true state. If a thin line leaves the thick one of its colour, the model was wrong or the plan
+# changed. The side on which the pole comes up is random. One step ahead, most errors should be below two standard
+# deviations.
 
 colours = {"EVGP-IFG": "#0072B2", "without physics": "#D55E00"}
 has_cart = task.system == "cartpole"
@@ -125,30 +126,38 @@ ax.set(aspect="equal", xlim=(-0.9, 1.5 * len(frames) - 0.6), ylim=(-1.1, 0.65))
 ax.axis("off")
 ax.set_title(f"EVGP-IFG, learned from {seconds:g} s of data" + (", with the force that acts" if has_cart else ""))
 
-for ax, (name, run) in zip(middle.subplots(1, 2, sharey=True), runs.items(), strict=True):
+ax = middle.subplots()
+for name, run in runs.items():
     for step in range(0, task.n_steps, 8):
         plan = run.plans[step][:, task.pole]
-        label = "plans" if step == 0 else None
-        ax.plot(DT * (step + np.arange(len(plan))), plan, color=colours[name], alpha=0.4, linewidth=0.8, label=label)
-    ax.plot(times, run.states[:, task.pole], color=colours[name], linewidth=2.5, label="what happened")
+        ax.plot(DT * (step + np.arange(len(plan))), plan, color=colours[name], alpha=0.4, linewidth=0.8)
+    label = f"{name}: {'upright' if run.success else 'not upright'} in the last second"
+    style = "-" if name == "EVGP-IFG" else "--"  # they may lie on each other
+    ax.plot(times, run.states[:, task.pole], style, color=colours[name], linewidth=2.5, label=label)
     turns = np.round((run.states[-1, task.pole] / np.pi - 1.0) / 2.0)
-    ax.axhline(np.pi * (1.0 + 2.0 * turns), color="0.3", linestyle=":", label="upright")
-    ax.set(title=f"{name}: {'upright' if run.success else 'not upright'} in the last second", xlabel="time (s)")
-    ax.set(xlim=(0.0, times[-1]), ylabel="pole's angle from hanging (rad)")
-    ax.legend()
+    ax.axhline(np.pi * (1.0 + 2.0 * turns), color="0.3", linestyle=":", zorder=0)
+ax.plot([], [], color="0.3", alpha=0.4, linewidth=0.8, label="plans")
+ax.plot([], [], color="0.3", linestyle=":", label="upright")
+ax.set(title="Plans and what happened", xlabel="time (s)", xlim=(0.0, times[-1]))
+ax.set_ylabel("pole's angle from hanging (rad)")
+ax.legend(loc="center right")
 
 left, right = bottom.subplots(1, 2)
 for name, run in runs.items():
-    left.step(times[:-1], run.inputs[:, 0], where="post", color=colours[name], label=name)
+    style = "-" if name == "EVGP-IFG" else "--"
+    left.step(times[:-1], run.inputs[:, 0], style, where="post", color=colours[name], label=name)
     mean, std = learned[name].model.predict(np.hstack([run.states[:-1], run.inputs]), return_std=True)
     error = np.abs(mean - run.states[1:])[:, -1]
-    right.plot(times[1:], error, color=colours[name], linewidth=1, label=f"{name}: |error|")
-    right.plot(times[1:], 2.0 * std[:, -1], color=colours[name], linestyle=":", label="2 std")
+    right.plot(times[1:], error, color=colours[name], linewidth=1)
+    right.plot(times[1:], 2.0 * std[:, -1], color=colours[name], linestyle=":")
+right.plot([], [], "k", linewidth=1, label="|error|")
+right.plot([], [], "k:", label="2 std")
 left.set(title="What the controller did", xlabel="time (s)", ylabel=push, xlim=(0.0, times[-1]))
-right.set(title="One step ahead: the pole's angular velocity", xlabel="time (s)", ylabel="rad/s", yscale="log")
-right.set(xlim=(0.0, times[-1]), ylim=(0.02 * right.get_ylim()[0], None))  # room for the legend
+right.set(title="Errors one step ahead", xlabel="time (s)", ylabel="pole's velocity (rad/s)", yscale="log")
+right.yaxis.set_major_formatter("{x:g}")
+right.set_xlim(0.0, times[-1])
 left.legend()
-right.legend(loc="lower center", ncols=2)
+right.legend()
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / f"swing_up_{task.system}.png"

@@ -107,11 +107,12 @@ for width, (durations, _) in planned.items():
 # %%
 # Plot the results
 # ----------------
-# Intervals are wide where joints stand still, because friction may have any value up to Coulomb's.
+# The lower row shows one move that exceeds a limit if only the mean is below it. Intervals are wide where joints stand
+# still, at both ends, because friction may have any value up to Coulomb's.
 
 blue, orange, grey = "#0072B2", "#D55E00", "0.35"
 colours = dict(zip(runs, (orange, blue), strict=True))
-figure, axes = plt.subplots(3, 2, figsize=(8, 8))
+figure, ((of_path, of_peaks), one_move) = plt.subplots(2, 2, figsize=(8, 6.2))
 data = nominal.model.createData()
 
 
@@ -127,26 +128,16 @@ def tip(q):
 times, wanted = DT * np.arange(len(reference)), reference[:, 0]
 desired = tip(wanted[:, :n_joints])
 part = times < 4.0
-axes[0, 0].plot(*desired[part, 1:].T, color=grey, linewidth=5, alpha=0.35, label="reference")
+of_path.plot(*desired[part, 1:].T, color=grey, linewidth=5, alpha=0.35, label="reference")
 for name, run in runs.items():
     place = tip(wanted[:, :n_joints] + run.error[:, 0])
-    axes[0, 0].plot(*place[part, 1:].T, color=colours[name], linewidth=1.3, label=name)
     off = 1e3 * np.linalg.norm(place - desired, axis=1)
-    axes[0, 1].plot(times, off, color=colours[name], label=f"{name}: {np.sqrt(np.mean(off**2)):.2g} mm rms")
-axes[0, 0].set(title="The hand, seen from the front", xlabel="y (m)", ylabel="z (m)", aspect="equal")
-axes[0, 1].set(title="How far the hand is off", xlabel="time (s)", ylabel="mm", yscale="log", ylim=(0.02, 200.0))
-
-joint = 3
-run = runs["with the learned torques"]
-mean, std = (part[:, joint] for part in model.predict(run.motion[:, 0], return_std=True))
-believed = nominal.forces(*np.split(run.motion[:, 0], 3, axis=1))[:, joint]
-ax = axes[2, 0]
-ax.plot(times, run.torque[:, 0, joint], ".", color="0.6", markersize=2, label="measured")
-ax.plot(times, believed, color=orange, linewidth=1, label="nominal model")
-ax.plot(times, mean, color=blue, linewidth=1, label="learned, ± 2 std")
-ax.fill_between(times, mean - 2 * std, mean + 2 * std, color=blue, alpha=0.3, linewidth=0, zorder=3)
-ax.set_xlim(0.5, 3.5)
-ax.set(title=f"Torque of joint {joint + 1} on the way", xlabel="time (s)", ylabel="N m")
+    label = f"{name}: {np.sqrt(np.mean(off**2)):.2g} mm rms off"
+    of_path.plot(*place[part, 1:].T, color=colours[name], linewidth=1.3, label=label)
+of_path.set(title="The hand, seen from the front", xlabel="y (m)", ylabel="z (m)")
+low, high = of_path.get_ylim()
+of_path.set_ylim(low, high + 0.4 * (high - low))  # below the legend
+of_path.legend(loc="upper right")
 
 # Without caution: the median of the moves that exceed a limit, at the joint, step and side where it does.
 by_peak = np.argsort(tried[0.0][3])
@@ -155,7 +146,7 @@ over = np.abs(tried[0.0][2][:, move]) / limits
 over[round(tried[0.0][0][move] / DT) :] = 0.0
 step, joint = np.unravel_index(over.argmax(), over.shape)
 side, shown = np.sign(tried[0.0][2][step, move, joint]), []
-for ax, (width, (durations, path, torque, _)) in zip(axes[1], tried.items(), strict=False):
+for ax, (width, (durations, path, torque, _)) in zip(one_move, tried.items(), strict=False):
     until = round(durations[move] / DT)
     t, measured = DT * np.arange(until), side * torque[:until, move, joint]
     mean, std = (part[:, joint] for part in model.predict(path[:until, move], return_std=True))
@@ -174,20 +165,20 @@ for ax, (width, (durations, path, torque, _)) in zip(axes[1], tried.items(), str
     ax.set(ylabel=f"torque of joint {joint + 1} (N m)")
     shown.append(side * mean - k * std)
 low = min(values.min() for values in shown)
-for ax in axes[1]:
+for ax in one_move:
     ax.set_ylim(low, limits[joint] + 0.12 * (limits[joint] - low))
+figure.legend(*one_move[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
 bins = np.linspace(*np.percentile(np.concatenate([each[3] for each in tried.values()]), (0, 100)), 25)
 for (width, (*_, peak)), colour in zip(tried.items(), (orange, blue), strict=True):
     what = f"mean + {width:.1f} std" if width else "mean"
-    label = f"{what}: {np.mean(peak > 1.0):.0%} break a limit"
-    axes[2, 1].hist(peak, bins, color=colour, alpha=0.6, label=label)
-axes[2, 1].axvline(1.0, color="k", linestyle="--", linewidth=1)
-axes[2, 1].set(title=f"Largest torque of {len(starts)} moves", xlabel="share of the limit", ylabel="moves")
-axes[2, 1].yaxis.get_major_locator().set_params(integer=True)
-axes[2, 1].margins(y=0.25)  # above which the legend is
-for ax in axes.ravel():
-    ax.legend(loc="lower center" if ax in axes[1] else "best")
+    label = f"{what}: {np.mean(peak > 1.0):.0%} above"
+    of_peaks.hist(peak, bins, color=colour, alpha=0.6, label=label)
+of_peaks.axvline(1.0, color="k", linestyle="--", linewidth=1)
+of_peaks.set(title=f"Largest torque of {len(starts)} moves", xlabel="share of the limit", ylabel="number of moves")
+of_peaks.yaxis.get_major_locator().set_params(integer=True)
+of_peaks.margins(y=0.35)  # above which the legend is
+of_peaks.legend(loc="upper left")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "tracking.png"

@@ -74,6 +74,7 @@ def test_inducing_points_are_crosses_on_the_lower_edge():
 
 def test_bars_are_so_many_standard_deviations():
     display = CoefficientDisplay(["a", "b"], *np.array([[1.0, 2.0], [0.1, 0.2], [3.0, 4.0], [0.3, 0.4]])).plot(n_std=3)
+    assert display.ax_.get_xlabel() == "weight"
     prior, posterior = display.ax_.containers
     assert (prior.get_label(), posterior.get_label()) == ("prior ±3 std", "posterior ±3 std")
     for container, means, stds in ((prior, [3.0, 4.0], [0.3, 0.4]), (posterior, [1.0, 2.0], [0.1, 0.2])):

@@ -113,36 +113,44 @@ def pretty(name: str) -> str:
 
 
 def plot(rows: pd.DataFrame, path: Path) -> None:
-    """Draw heat maps of prior, least squares and posterior, a column of panels per model; means over seeds."""
-    from matplotlib.colors import LogNorm, SymLogNorm
+    """Draw heat maps of posterior means and standard deviations, a column of panels per model; means over seeds."""
+    from matplotlib.colors import SymLogNorm
+    from matplotlib.patches import Rectangle
 
     settings, models = ordered(SETTINGS, rows["setting"]), ordered(MODELS, rows["model"])
-    lines = [("prior mean", settings[0], "prior_mean"), ("least squares", settings[0], "least_squares")]
-    lines += [(f"{what}, {SETTINGS[s]}", s, value) for what, value in (("b", "mean"), ("std", "std")) for s in settings]
     outputs = list(rows["output"].unique())
-    size = (harness.WIDTH, 0.4 + len(lines) * (0.45 + 0.3 * len(outputs)))
-    figure, grid = harness.pyplot().subplots(len(lines), len(models), figsize=size, squeeze=False)
-    stds = rows.loc[rows["std"] > 0, "std"]
-    styles = {
-        False: {"cmap": "RdBu_r", "norm": SymLogNorm(0.05, vmin=-1.0, vmax=1.0)},
-        True: {"cmap": "Greys", "norm": LogNorm(stds.min(), 10.0 * stds.max())},
-    }
-    for line, (title, setting, value) in zip(grid, lines, strict=True):
+    half = len(outputs) // 2
+    size = (harness.WIDTH, 0.3 + len(settings) * (0.6 + 0.39 * len(outputs)))
+    figure, grid = harness.pyplot().subplots(len(settings), len(models), figsize=size, squeeze=False)
+    for line, setting in zip(grid, settings, strict=True):
         for axes, model in zip(line, models, strict=True):
             own = rows[(rows["setting"] == setting) & (rows["model"] == model)]
-            means = own.groupby(["output", "feature"], sort=False)[value].mean().unstack(sort=False)
-            picture = axes.imshow(means, aspect="auto", **styles[value == "std"])
-            axes.set_xticks(range(means.shape[1]), map(pretty, means.columns), fontsize=8)
-            axes.set_yticks(range(means.shape[0]), map(pretty, means.index), fontsize=8)
+            tables = own.groupby(["output", "feature"], sort=False)[["mean", "std"]].mean().unstack(sort=False)
+            means, stds = tables["mean"], tables["std"]
+            picture = axes.imshow(means, aspect="auto", cmap="RdBu_r", norm=SymLogNorm(0.05, vmin=-1.0, vmax=1.0))
+            axes.set_xticks(range(means.shape[1]), map(pretty, means.columns), fontsize=12)
+            axes.set_yticks(range(means.shape[0]), map(pretty, means.index), fontsize=12)
             axes.grid(False)
-            axes.set_title(f"{model}: {title}")
+            axes.set_title(f"{model}, {SETTINGS[setting]}")
+            for place in range(half):  # of positions on velocities
+                corner = (list(means.columns).index(outputs[place]) - 0.5, half + place - 0.5)
+                axes.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, edgecolor="k", linewidth=1.5))
             if means.shape[1] <= 12:
                 for (o, j), mean in np.ndenumerate(means):
                     dark = np.mean(picture.cmap(picture.norm(mean))[:3]) < 0.5
-                    text = f"{mean:.0e}" if 0.0 < abs(mean) < 5e-4 else f"{mean:.3g}"
-                    axes.text(j, o, text, ha="center", va="center", fontsize=7, color="w" if dark else "k")
-    figure.suptitle(f"{rows['system'].iloc[0]}: means over {rows['seed'].nunique()} seeds; b, std: posterior")
+                    text = f"{short(mean)}\n±{short(stds.iloc[o, j])}"
+                    color = "w" if dark else "k"
+                    axes.text(j, o, text, ha="center", va="center", fontsize=8.5, linespacing=1.0, color=color)
+    seeds = f"means over {rows['seed'].nunique()} seeds"
+    figure.suptitle(f"{rows['system'].iloc[0]}: weights (SI units) ± their posterior std, {seeds}")
     harness.save_picture(figure, path)
+
+
+def short(value: float) -> str:
+    """Write a number in at most six characters: 0.0304 -> .030, 0.00002 -> 2e-5."""
+    if 0.0 < abs(value) < 5e-4:
+        return f"{value:.0e}".replace("e-0", "e-")
+    return f"{value:.3f}".replace("0.", ".", 1)
 
 
 def main() -> None:

@@ -182,6 +182,13 @@ def table_of(curves: list[Curve], data: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def short(name: str) -> str:
+    """Shorten the name of a curve for the legend of a panel that says the rest."""
+    for part in (" and gradient", "model, ", ", pickled"):
+        name = name.replace(part, "")
+    return name
+
+
 def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
     """Draw time against widths, rows and outputs, and space against widths."""
     panels = {
@@ -192,23 +199,25 @@ def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
     }
     figure, grid = harness.pyplot().subplots(2, 2, figsize=(harness.WIDTH, 7.0))
     for axes, (title, varied) in zip(grid.flat, panels.items(), strict=True):
-        value, unit, scale = ("n_bytes", "MB", 1e-6) if title.startswith("Space") else ("seconds", "ms", 1e3)
+        value, label, scale = "seconds", "time (ms)", 1e3
+        if title.startswith("Space"):
+            value, label, scale = "n_bytes", "pickled (MB)", 1e-6
         shown = [curve for curve in curves if curve.varied in varied and curve.value == value]
         axes.set_visible(bool(shown))
         for number, curve in enumerate(shown):
             points = points_of(curve, data)
-            label = f"{curve.name}: {exponents(curve, points)[0]:.2f}"
+            name = f"{short(curve.name)}: {exponents(curve, points)[0]:.2f}"
             marker = "o" if number < len(harness.PALETTE) else "s"  # colours begin again
-            axes.plot(scale * points, f"{marker}{':' if curve.few else '-'}", markersize=4, label=label)
+            axes.plot(scale * points, f"{marker}{':' if curve.few else '-'}", markersize=4, label=name)
         if not shown:
             continue
         for which in "xy":
             harness.logarithmic(axes, which)
         low, high = axes.get_ylim()
-        axes.set_ylim(low, high * (high / low) ** 0.6)  # room for the legend
-        axes.set(title=title, xlabel=" or ".join(LABELS[name] for name in varied), ylabel=unit)
-        axes.legend(loc="upper left", fontsize=7)
-    figure.suptitle("Numbers in the legends: exponents of power laws")
+        axes.set_ylim(low, high * (high / low) ** (0.11 * len(shown)))  # room for the legend
+        axes.set(title=title, xlabel=" or ".join(LABELS[name] for name in varied), ylabel=label)
+        axes.legend(loc="upper left")
+    figure.suptitle("Numbers in the legends: exponents of power laws; bound: with its gradient")
     harness.save_picture(figure, path)
 
 

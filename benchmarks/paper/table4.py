@@ -161,11 +161,17 @@ def details(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def drawn(rows: pd.DataFrame) -> list[str]:
+    """Return the systems of pictures: the paper's four, of the two cartpoles the one with damping."""
+    systems = ordered(SYSTEMS, rows["system"])
+    return [system for system in systems if system != "cartpole" or "cartpole_damped" not in systems]
+
+
 def plot_errors(rows: pd.DataFrame, path: Path) -> None:
     """Draw a panel per system: bars of the paper, a marker for each setting."""
-    systems, rows = ordered(SYSTEMS, rows["system"]), sorted_rows(rows[rows["angles"] == "raw"])
+    systems, rows = drawn(rows), sorted_rows(rows[rows["angles"] == "raw"])
     n_lines = -(-len(systems) // 2)
-    figure, grid = harness.pyplot().subplots(n_lines, 2, figsize=(harness.WIDTH, 2.4 + 2.9 * n_lines), squeeze=False)
+    figure, grid = harness.pyplot().subplots(n_lines, 2, figsize=(harness.WIDTH, 1.4 + 2.9 * n_lines), squeeze=False)
     places = np.arange(len(MODELS))
     for axes, system in zip(grid.flat, systems, strict=False):
         papers = PUBLISHED.loc[system]["error"].reindex(MODELS)
@@ -178,8 +184,9 @@ def plot_errors(rows: pd.DataFrame, path: Path) -> None:
             axes.plot([place] * len(values), values, ".", color=colour, markersize=4, alpha=0.5)
             axes.plot(place, values.mean(), MARKERS[setting], label=f"ours: {setting}", **style)
             axes.plot(place, own["error_inside"].mean(), "_", color=colour, markersize=12)
-        axes.set_xticks(places, MODELS, fontsize=8)
-        axes.set(title=system, ylabel="test Error (SI units)", yscale="log")
+        axes.set_xticks(places, [model.replace("-", "-\n") for model in MODELS])
+        axes.set(title=system, ylabel="test Error (SI units)")
+        harness.logarithmic(axes)
     for axes in grid.flat[len(systems) :]:
         axes.set_axis_off()
     title = "large: mean; small: each data set; dash: mean inside the training range\n"
@@ -188,27 +195,30 @@ def plot_errors(rows: pd.DataFrame, path: Path) -> None:
 
 
 def plot_reliability(rows: pd.DataFrame, path: Path) -> None:
-    """Draw a panel per system and setting: the share that intervals hold less the share that they promise."""
+    """Draw a panel per system: the share that intervals hold less the share that they promise."""
     # Old rows have no such shares.
     rows = rows[(rows["angles"] == "raw") & rows[f"within_{PROMISED[0]}"].notna()]
-    panels = rows.groupby("system")["setting"].unique()
-    systems = ordered(SYSTEMS, panels.index)
-    n_columns = max(map(len, panels))
-    size = {"figsize": (harness.WIDTH, 1.1 + 1.7 * len(systems)), "squeeze": False}
-    figure, grid = harness.pyplot().subplots(len(systems), n_columns, sharex=True, sharey=True, **size)
-    for line, system in zip(grid, systems, strict=True):
-        settings = ordered(SETTINGS, panels[system])
-        for axes in line[len(settings) :]:
-            axes.set_axis_off()
-        for axes, setting in zip(line, settings, strict=False):
-            own = rows[(rows["system"] == system) & (rows["setting"] == setting)]
-            axes.axhline(0.0, color="black", label="as promised")
+    systems, settings = drawn(rows), ordered(SETTINGS, rows["setting"])
+    n_lines = -(-len(systems) // 2)
+    size = {"figsize": (harness.WIDTH, 1.4 + 2.5 * n_lines), "squeeze": False}
+    figure, grid = harness.pyplot().subplots(n_lines, 2, sharex=True, sharey=True, **size)
+    for axes, system in zip(grid.flat, systems, strict=False):
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        for setting, style in zip(settings, ("o-", "s:", "^--", "D-."), strict=False):
             for model, colour in zip(MODELS, harness.PALETTE, strict=False):
-                held = own[own["model"] == model][[f"within_{share}" for share in PROMISED]].mean()
-                axes.plot(PROMISED, held.to_numpy() - PROMISED, "o-", color=colour, markersize=4, label=model)
-            axes.set_title(f"{system}, {setting}")
-        line[0].set_ylabel("held - promised")
-    harness.legend(figure, ncols=3, title="share promised: horizontal; means over data sets")
+                own = rows[(rows["system"] == system) & (rows["setting"] == setting) & (rows["model"] == model)]
+                held = own[[f"within_{share}" for share in PROMISED]].mean()
+                if len(own):
+                    label = f"{model}, {setting}"
+                    axes.plot(PROMISED, held.to_numpy() - PROMISED, style, color=colour, markersize=4, label=label)
+        axes.set_title(system)
+    for axes in grid.flat[len(systems) :]:
+        axes.set_axis_off()
+    for axes in grid[-1]:
+        axes.set_xlabel("share promised")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("share held - promised")
+    harness.legend(figure, ncols=4, title="means over data sets")
     harness.save_picture(figure, path)
 
 

@@ -63,6 +63,16 @@ MEASURES = {
     "nlpd": "NLPD",
     "log_likelihood": "log likelihood / N",
 }
+# What the picture shows, and names of its axes and lines.
+DRAWN = {"cartpole": "cartpole", "smooth": "smooth function of 8 columns"}
+AXES = {"fit_seconds": "time of a fit (s)", "error": "mean test error (units of y)"}
+NAMES = {
+    "GPR": "GaussianProcessRegressor",
+    "EVGP": "EVGPRegressor",
+    "EGP": "EGPRegressor",
+    "EGP-IFG": "EGPRegressor, physics",
+    "EVGP-IFG": "EVGPRegressor, physics",
+}
 
 Cell = namedtuple("Cell", "system model n_rows seed")
 
@@ -209,25 +219,23 @@ def tables_of(rows: pd.DataFrame) -> harness.Tables:
 
 
 def plot(rows: pd.DataFrame, path: Path) -> None:
-    """Draw time, memory, error and NLPD over N; a column of panels per data set."""
-    systems = ordered(SYSTEMS, rows["system"])
-    names = ("fit_seconds", "memory_mb", "error", "nlpd")
-    options = {"figsize": (harness.WIDTH, 8.4), "squeeze": False, "sharex": "col"}
-    figure, grid = harness.pyplot().subplots(len(names), len(systems), **options)
+    """Draw time and error over N; a column of panels for each of two data sets."""
+    systems = ordered(DRAWN, rows["system"]) or ordered(SYSTEMS, rows["system"])[:2]
+    options = {"figsize": (harness.WIDTH, 5.8), "squeeze": False, "sharex": "col"}
+    figure, grid = harness.pyplot().subplots(len(AXES), len(systems), **options)
     for panels, system in zip(grid.T, systems, strict=True):
-        panels[0].set_title(system)
-        panels[-1].set_xlabel("rows, N")
-        for axes, name in zip(panels, names, strict=True):
+        panels[0].set_title(DRAWN.get(system, system))
+        panels[-1].set_xlabel("training rows, N")
+        for axes, name in zip(panels, AXES, strict=True):
             for model, colour, marker in zip(MODELS, harness.PALETTE, "sDov^", strict=False):
                 own = rows[(rows["system"] == system) & (rows["model"] == model)].groupby("n_rows")[name].mean()
                 if len(own):
-                    axes.plot(own, f"{marker}-", color=colour, label=model)
-            if name != "nlpd":
-                harness.logarithmic(axes)
+                    axes.plot(own, f"{marker}-", color=colour, label=NAMES[model])
+            harness.logarithmic(axes)
         harness.logarithmic(panels[-1], "x")
-    for axes, name in zip(grid[:, 0], names, strict=True):
-        axes.set_ylabel(MEASURES[name])
-    harness.legend(figure, ncols=5)
+    for axes, label in zip(grid[:, 0], AXES.values(), strict=True):
+        axes.set_ylabel(label)
+    harness.legend(figure, ncols=3)
     harness.save_picture(figure, path)
 
 

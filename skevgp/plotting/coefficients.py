@@ -141,6 +141,7 @@ class CoefficientDisplay:
         ax.set_yticks(places, self.names)
         ax.margins(x=0.1)
         ax.set_ylim(-0.6, len(self.names) - 0.4)
+        ax.set_xlabel("weight")
         self.ax_, self.figure_ = ax, ax.figure
         return self
 
