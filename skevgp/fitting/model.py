@@ -244,6 +244,11 @@ class Model:
         width = d + p + o if self.sparse.kernels is None else g * (d + p) + o
         return () if self.interpolates else self.rules.samples(len(self.rows), self.n_inducing + p, width)
 
+    @property
+    def are_lengthscales(self) -> np.ndarray:
+        """Whether each hyperparameter is the length scale of one of several columns, (n_hyper,)."""
+        return self.problem.spec.covariance.are_lengthscales
+
     @cached_property
     def _sample(self) -> Rows:
         return self.rows.random_subset(self.samples[-1], self.rng)

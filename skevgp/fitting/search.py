@@ -76,6 +76,9 @@ class Rules:
     # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
     # `LARGEST_SAMPLE`, are left out.
     growth: int = 4
+    # In a fit to more rows, length scales of columns start at most at so many times the first ones. A small sample may
+    # not show that a column matters, and the gradient of a long length scale is almost 0.
+    longest: float = 10.0
     # A restart multiplies the first values by random numbers between 1 / factor and the factor, log-uniformly.
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
@@ -246,15 +249,20 @@ class Search:
         stage, samples = self.rules.stage, self.model.samples
         if stage is None or not samples or self.max_iter == 0:
             return self._stages(values, self.max_iter)
-        few = min(2 * stage, self.max_iter)
+        few, most = min(2 * stage, self.max_iter), self.rules.longest * values["hyperparameters"]
+        most = np.where(self.model.are_lengthscales, most, np.inf)
+
+        def shortened(fit: Fit) -> Values:
+            return fit.values | {"hyperparameters": np.minimum(fit.values["hyperparameters"], most)}
+
         best = self._stages(values, few, samples[0])
         for n_rows in samples[1:]:
             if self.collapsed(best):
                 best = self._stages(values, few, n_rows)
             else:
-                best = self._fit(Start(best.values, self.max_iter, n_rows=n_rows))
+                best = self._fit(Start(shortened(best), self.max_iter, n_rows=n_rows))
         if not self.collapsed(best):
-            best = self._fit(Start(best.values, self.max_iter))
+            best = self._fit(Start(shortened(best), self.max_iter))
             if not self.collapsed(best):
                 return best
         return better(best, self._stages(values, self.max_iter))

@@ -178,6 +178,11 @@ class Covariance(ABC):
         """Number of hyperparameters."""
 
     @property
+    def are_lengthscales(self) -> np.ndarray:
+        """Whether each hyperparameter is the length scale of one of several columns, (n_hyper,)."""
+        return np.zeros(self.n_hyperparameters, dtype=bool)
+
+    @property
     @abstractmethod
     def rows(self) -> Preparation:
         """Function that prepares rows once; parts of a sum or product share it if theirs are equal."""
@@ -229,6 +234,10 @@ class _Combination(Covariance):
     @property
     def n_hyperparameters(self) -> int:
         return sum(part.n_hyperparameters for part in self.parts)
+
+    @property
+    def are_lengthscales(self) -> np.ndarray:
+        return np.concatenate([part.are_lengthscales for part in self.parts])
 
     @property
     def preparations(self) -> tuple[Preparation, ...]:

@@ -356,6 +356,11 @@ class Stationary(Covariance):
     def n_hyperparameters(self) -> int:
         return self.profile.n_parameters + (1 if self.isotropic else self.n_columns)
 
+    @property
+    def are_lengthscales(self) -> np.ndarray:
+        own = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
+        return own & (not self.isotropic)
+
     def centred(self, centre: np.ndarray) -> Stationary:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 

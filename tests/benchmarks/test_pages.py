@@ -182,7 +182,7 @@ SAID = [
         "least squares, then a Gaussian process |" + 9 * " {} |",
         lambda: arm("least squares, then GP"),
     ),
-    ("docs/which_model", "by a factor of {}", lambda: arm("EVGP", "ur10", "whole")[:1]),
+    ("docs/which_model", "the error of `InverseDynamics` is {} times", lambda: arm("EVGP", "ur10", "whole")[:1]),
     ("docs/benchmarks", "took GPflow {} s", lambda: peer("elevators", "GPflow SGPR")[:1]),
     ("docs/benchmarks", "fixed jitters in {}, and at most {} times that", jitters),
     ("docs/benchmarks", 'on {} of 20 sets, 100 points on {}. "auto" took up to {} times', inducing),

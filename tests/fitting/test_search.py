@@ -44,6 +44,7 @@ def model(**changes):
         "alone": FeaturesAlone(),
         "interpolates": False,
         "samples": (),
+        "are_lengthscales": np.array([True, False]),
         "place": None,
         "warm": None,
         "placed": False,
@@ -66,6 +67,7 @@ def drive(model, *results, stop_after=None):
             model.monitor.stop()
         bound, options = results.pop(0)
         values = start.values | {"noise": np.full(2, options.get("noise", 1e-4))}
+        values["hyperparameters"] = options.get("stretch", 1.0) * values["hyperparameters"]
         if "signal" in options:
             values["signal"] = np.array(options["signal"])
         curve = [0.0] * options.get("n_iter", start.until)
@@ -208,6 +210,15 @@ def test_fit_climbs_from_sample_to_sample_to_all_rows():
         assert later.after is None
     # A fit to more rows is the better one, whatever the bounds of samples.
     assert (best.bound, best.n_rows) == (2.0, None)
+
+
+def test_length_scales_are_shortened_before_a_fit_to_more_rows():
+    own = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000))
+    made, best = drive(own, (5.0, {"stretch": 1e3}), (4.0, {"stretch": 1e3}), (3.0, {"stretch": 1e3}))
+    lengths, others = np.array([start.values["hyperparameters"] for start in made]).T
+    np.testing.assert_allclose(lengths, [2.0, 20.0, 20.0])  # at most 10 times the first one
+    np.testing.assert_allclose(others, [3.0, 3e3, 3e6])
+    np.testing.assert_allclose(best.values["hyperparameters"], [2e4, 3e9])
 
 
 def test_collapse_on_all_rows_restarts():
