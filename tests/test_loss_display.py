@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 from numpy.testing import assert_array_equal
+from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_toy
@@ -32,6 +35,19 @@ def test_line_is_minus_the_loss(sparse):
     assert_array_equal(display.line_.get_xdata(), np.arange(1, sparse.n_iter_ + 1))
     assert (display.line_.get_label(), display.line_.get_color()) == ("m", "black")
     assert display.ax_.get_ylabel() == "lower bound (nats)"
+
+
+def test_pipeline_shows_its_last_step(sparse):
+    pipe = make_pipeline(FunctionTransformer(), clone(sparse)).fit(X, y)
+    assert_array_equal(LossDisplay.from_estimator(pipe).bound, -sparse.loss_curve_)
+
+
+@pytest.mark.parametrize(("n_iter", "first"), [(19, True), (40, False)])
+def test_axis_leaves_out_the_beginning_of_long_fits_only(n_iter, first):
+    bound = -(0.5 ** np.arange(n_iter))
+    low, high = LossDisplay(bound).plot().ax_.get_ylim()
+    assert (low < bound[0]) == first
+    assert high > bound[-1]
 
 
 def test_model_without_iterations_raises():

@@ -5,9 +5,13 @@ from __future__ import annotations
 from typing import Any, Self
 
 import numpy as np
+from sklearn.pipeline import Pipeline
 
 from ..utils.validation import check_fitted
 from ._style import axes_of, free_color
+
+# Least number of iterations of a fit whose first quarter is not shown.
+_LONG = 20
 
 
 class LossDisplay:
@@ -60,7 +64,8 @@ class LossDisplay:
         Parameters
         ----------
         estimator : EVGPRegressor, EGPRegressor or BayesianMLPRegressor
-            Fitted regressor with at least one iteration. Values of Adam are estimates from mini-batches.
+            Fitted regressor with at least one iteration, or a pipeline that ends with one. Values of Adam are estimates
+            from mini-batches.
         gap : bool, default=False
             Whether to draw the distance to the best bound, as in `plot`.
         ax : matplotlib Axes, default=None
@@ -79,6 +84,8 @@ class LossDisplay:
             If there are no iterations, for example after ``max_iter=0``.
         """
         check_fitted(estimator)
+        if isinstance(estimator, Pipeline):
+            estimator = estimator[-1]
         bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
         bound[~np.isfinite(bound)] = np.nan  # a user's optimizer may have tried points that cannot be evaluated
         if not np.isfinite(bound).any():
@@ -92,8 +99,8 @@ class LossDisplay:
     def plot(self, ax: Any = None, *, gap: bool = False, label: str | None = None, color: str | None = None) -> Self:
         """Draw the display.
 
-        Without ``gap``, the vertical axis leaves out the first quarter of the iterations, because its large gain would
-        hide all later gains.
+        Without ``gap``, the vertical axis of a fit of 20 iterations or more leaves out the first quarter, because its
+        large gain would hide all later gains.
 
         Parameters
         ----------
@@ -122,7 +129,7 @@ class LossDisplay:
             ax.set_yscale("log")
         else:
             known = self.bound[np.isfinite(self.bound)]
-            late = known[len(known) // 4 :]
+            late = known[len(known) // 4 :] if len(known) >= _LONG else known
             margin = 0.05 * (late.max() - late.min()) or 1.0
             ax.set_ylim(
                 min(late.min() - margin, *(low for low, _ in others), np.inf),
