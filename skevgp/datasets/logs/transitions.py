@@ -22,6 +22,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
     gap, a jump of a position or rest are left out, and so are rows with the time of another row. If `load_log`
     had a ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay.
+    :doc:`Learn the next state from your own logs </howto/next_state>` has an example, and one without velocities.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
         raise ValueError(
             f"{recording.filename}: there are no recorded velocities, which the states need. If the file has some, "
             'pass their columns, without velocity="derive". Otherwise make rows from the filtered log.data, as in the '
-            'guide "Learn the next state from your own logs". Differences of unfiltered positions are too noisy.'
+            'how-to "Learn the next state from your own logs". Differences of unfiltered positions are too noisy.'
         )
     steps = np.diff(raw.time)
     whole = np.ones(len(steps), dtype=bool)
