@@ -294,7 +294,9 @@ def _drive(regressor: Any, batch: np.ndarray, given: ArrayLike | Controller, n_s
         U = U[:, np.newaxis]
     shapes = f"(n_steps, {n_inputs}) or (n_batch, n_steps, {n_inputs}) with n_batch={len(batch)}"
     if U.ndim not in (2, 3) or U.shape[-1] != n_inputs or (U.ndim == 3 and len(U) != len(batch)):
-        raise ValueError(f"U must be of shape {shapes}: rows of the regressor are [z, u]; got {U.shape}.")
+        missing = U.ndim > 0 and U.shape[-1] == n_inputs - 1
+        hint = ' If its features have dt="column", inputs are [u, Δt].' if missing else ""
+        raise ValueError(f"U must be of shape {shapes}: rows of the regressor are [z, u]; got {U.shape}.{hint}")
     if U.shape[-2] == 0:
         raise ValueError(f"U has no steps: its shape is {U.shape}.")
     return _Drive(U.shape[-2], n_inputs, np.broadcast_to(U, (len(batch), *U.shape[-2:])), None)

@@ -237,6 +237,13 @@ def feature_report(
     if trajectories is None:
         splits = list(KFold(n_splits, shuffle=True, random_state=check_random_state(random_state)).split(target))
     else:
+        n_groups = len(np.unique(trajectories))
+        if n_groups < n_splits:
+            have = "has one group" if n_groups == 1 else f"has {n_groups} groups"
+            raise ValueError(
+                f"groups {have}, but n_splits={n_splits} needs at least {n_splits}. Cut the recording into blocks of a "
+                "few seconds, and pass these as groups."
+            )
         splits = list(GroupKFold(n_splits).split(target, groups=trajectories))
     # The whole model first.
     nothing = np.zeros(labels.shape, dtype=bool)

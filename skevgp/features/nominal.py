@@ -222,6 +222,14 @@ class NominalDynamics(ParametricMap, RobotMap):
             allowed |= self._one_per_joint([kind], [joint for joint in range(n) if numbers[joint] > 0.0])
         return allowed
 
+    def _why_not(self, name: str) -> str:
+        kind, _, joint = name.removesuffix(")").partition("(")
+        if kind not in ("damping", "armature") or joint not in ("", *self._layout.position_names):
+            return ""
+        of_joint = f"joint {joint!r}" if joint else "any joint"
+        instead = " Add Friction(robot) to the features, which learns it." if kind == "damping" else ""
+        return f" The model of the robot has no {kind} above 0 for {of_joint}.{instead}"
+
     def _synonym(self, name: str) -> str:
         kind, _, owner = name.removesuffix(")").partition("(")
         joints = list(self._model().names)[1:]

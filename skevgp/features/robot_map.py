@@ -112,18 +112,22 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         """Raise ValueError unless X has the robot's columns in the robot's order, and dt last."""
         wanted, names = self._column_names(), list(getattr(self, "feature_names_in_", []))
         if self.n_features_in_ != len(wanted):
-            hint = "."
+            hint, takes_steps = ".", not self._timed and "dt" in self.get_params(deep=False)
             if self._timed:
                 hint = "; the last one, dt, is the time step of each row in seconds."
-            elif self.n_features_in_ == len(wanted) + 1:
-                hint = '; if there is one more, the time step of each row, say dt="column".'
-            n_columns = self.n_features_in_ - self._timed
-            # Joints with a motor have three columns each, also the accelerations of `RigidBodyRegressor`.
-            if 0 < n_columns < 3 * self._layout.n_joints and n_columns % 3 == 0:
+            elif takes_steps and self.n_features_in_ == len(wanted) + 1:
+                hint = '. If the last column is the time step of each row, pass dt="column".'
+            # Joints with a motor have three columns each, also the accelerations of `RigidBodyRegressor`. Rows of
+            # `log_transitions` also have a time step.
+            n_columns, fewer = self.n_features_in_ - self._timed, range(3, 3 * self._layout.n_joints, 3)
+            one_more = takes_steps and n_columns - 1 in fewer
+            if n_columns in fewer or one_more:
                 hint += (
                     " If only some joints were recorded, give the robot as load_robot(robot, joints=[...]), which "
                     "locks the others."
                 )
+            if one_more and len(wanted) + 1 != self.n_features_in_:
+                hint += ' If the last column is the time step of each row, also pass dt="column", or leave it out.'
             raise ValueError(
                 f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
                 f"{self._layout.name!r} needs {len(wanted)}: {wanted}{hint}"
@@ -344,7 +348,7 @@ class ParametricMap(RobotTransformer):
             if known not in allowed:
                 raise ValueError(
                     f"{type(self).__name__} of the robot {self._layout.name!r} has no parameter {name!r}. The "
-                    f"parameters that it can have are {list(allowed)}."
+                    f"parameters that it can have are {list(allowed)}.{self._why_not(known)}"
                 )
             check_prior(prior, name)
             kind, joints = allowed[known]
@@ -370,6 +374,10 @@ class ParametricMap(RobotTransformer):
     def _synonym(self, name: str) -> str:
         """Return the name in `_allowed_parameters` for a parameter's name."""
         return name
+
+    def _why_not(self, name: str) -> str:
+        """Return a sentence, after a space, on why a name is not in `_allowed_parameters`, if there is a reason."""
+        return ""
 
     def _allowed_parameters(self) -> dict[str, tuple[str, list[int]]]:
         """Return the names of all possible parameters, with their kind and joints."""

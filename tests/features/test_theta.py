@@ -177,6 +177,10 @@ INVALID = {
         NominalDynamics("acrobot", parameters={"damping(link)": POSITIVE}),
         "no parameter 'damping(link)'",
     ),
+    "damping of a model without damping": (
+        NominalDynamics("ur5", parameters={"damping(elbow_joint)": POSITIVE}),
+        "no damping above 0 for joint 'elbow_joint'. Add Friction(robot) to the features, which learns it.",
+    ),
     "same joint": (
         NominalDynamics("ur5", parameters={"mass(tool0)": POSITIVE, "mass(wrist_3_joint)": POSITIVE}),
         "'mass(tool0)' and 'mass(wrist_3_joint)' are for the same joint",

@@ -215,7 +215,7 @@ def test_invalid_width_says_what_the_last_column_is(kind):
         ANY[kind]("pendulum", dt="column").fit(X[:, :-1])
     plain = ANY[kind]("pendulum", dt=None if kind == "angles" else 0.03)
     with pytest.raises(
-        ValueError, match=r"needs 3: \['q', 'dq/dt', 'u_q'\]; .* the time step of each row, say dt=\"column\""
+        ValueError, match=r"needs 3: \['q', 'dq/dt', 'u_q'\]\. .* the time step of each row, pass dt=\"column\""
     ):
         plain.fit(X)
 

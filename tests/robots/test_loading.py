@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from skevgp import InverseDynamics
 from skevgp.datasets import make_dynamics
-from skevgp.features import RigidBodyRegressor
+from skevgp.features import InertiaForce, RigidBodyRegressor
 from skevgp.robots import SYSTEMS, RigidBody, System, get_system, layout_of, list_robots, load_robot, loading
 
 JOINT = """
@@ -198,6 +198,14 @@ def test_error_about_columns_says_how_to_lock_joints(n_columns, is_told):
     with pytest.raises(ValueError, match=rf"X has {n_columns} columns, but .* needs 27") as error:
         RigidBodyRegressor("panda").fit(np.zeros((3, n_columns)))
     assert ("give the robot as load_robot(robot, joints=[...]), which locks the others" in str(error.value)) == is_told
+
+
+@pytest.mark.parametrize(("n_columns", "is_told"), [(4, True), (3, False), (7, False)])
+def test_error_about_columns_knows_rows_of_log_transitions(n_columns, is_told):
+    with pytest.raises(ValueError, match=r"needs 6: .*dt=\"column\"|joints=\[") as error:
+        InertiaForce("double_pendulum").fit(np.ones((3, n_columns)))
+    both = "which locks the others. If the last column is the time step of each row, also pass"
+    assert (both in str(error.value)) == is_told
 
 
 # --- layouts -------------------------------------------------------------------------------------------------------

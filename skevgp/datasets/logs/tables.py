@@ -40,7 +40,7 @@ def check_columns(columns: Any) -> dict[str, list[int | str]]:
     if unknown or missing or len(set(_EFFORT) & set(columns)) != 1:
         raise ValueError(
             f"columns must name 'time', 'position', one of 'effort' and 'current', and perhaps 'velocity' and "
-            f"'acceleration'; got {list(columns)}."
+            f"'acceleration'; got {list(columns)}.{' Leave other columns out.' if unknown else ''}"
         )
     asked = {}
     for name, value in columns.items():

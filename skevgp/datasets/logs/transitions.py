@@ -22,6 +22,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
     gap, a jump of a position or rest are left out, and so are rows with the time of another row. If `load_log`
     had a ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay.
+    :doc:`Learn the next state from your own logs </howto/next_state>` has an example, and one without velocities.
 
     Parameters
     ----------
@@ -105,10 +106,17 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
         feature_names=[*states, *log.target_names, "dt"],
         target_names=states,
         DESCR=(
-            f"{len(data)} transitions of {stride} recorded rows, of {data[:, -1].min():.4g} to {data[:, -1].max():.4g} "
-            f"s, not filtered, without gaps, jumps and rest, of the files {', '.join(log.filenames)}."
+            f"{len(data)} transitions, each over {stride} recorded row{'s' if stride > 1 else ''} "
+            f"({_span(data[:, -1])} s), not filtered, without gaps, jumps and rest, of the files "
+            f"{', '.join(log.filenames)}."
         ),
     )
+
+
+def _span(dt: np.ndarray) -> str:
+    """Return the shortest and the longest time step in s, or one number if they are about the same."""
+    shortest, longest = f"{dt.min():.4g}", f"{dt.max():.4g}"
+    return shortest if shortest == longest else f"{shortest} to {longest}"
 
 
 def _transitions(recording: Bunch, stride: int) -> np.ndarray:
@@ -116,8 +124,9 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
     raw = recording.raw
     if raw.velocity is None:
         raise ValueError(
-            f"{recording.filename}: there are no recorded velocities, which the states need. Differences of "
-            'unfiltered positions are too noisy to replace them. velocity="derive" of load_log ignores velocities.'
+            f"{recording.filename}: there are no recorded velocities, which the states need. If the file has some, "
+            'pass their columns, without velocity="derive". Otherwise make rows from the filtered log.data, as in the '
+            'how-to "Learn the next state from your own logs". Differences of unfiltered positions are too noisy.'
         )
     steps = np.diff(raw.time)
     whole = np.ones(len(steps), dtype=bool)

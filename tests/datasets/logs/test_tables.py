@@ -96,7 +96,7 @@ def test_missing_columns_are_named_with_the_file(file, columns, message):
         ({"time": 0, "position": 1}, "columns must name 'time', 'position', one of 'effort' and 'current'"),
         ({"time": 0, "effort": 1}, "columns must name 'time', 'position'"),
         ({**BY_NUMBER, "effort": 1}, "one of 'effort' and 'current'"),
-        ({**BY_NUMBER, "speed": 1}, "columns must name .* got .*'speed'"),
+        ({**BY_NUMBER, "speed": 1}, "columns must name .* got .*'speed'\\]. Leave other columns out"),
         ({**BY_NUMBER, "time": [0, 1]}, r"columns\['time'\] must be one column; got \[0, 1\]"),
         ({**BY_NUMBER, "position": []}, r"columns\['position'\] must be at least one column"),
         ({**BY_NUMBER, "position": -1}, r"columns\['position'\] must be at least 0; got -1"),

@@ -75,8 +75,16 @@ def test_torques_are_the_efforts_recorded_later_by_the_delay(load, stride):
 
 def test_velocities_must_be_recorded(load):
     log = load(table_of(T), columns={"time": 0, "position": [1, 2], "effort": [6, 7]})
-    with pytest.raises(ValueError, match="0.csv: there are no recorded velocities"):
+    with pytest.raises(ValueError, match="0.csv: there are no recorded velocities.* make rows from the filtered"):
         log_transitions(log)
+
+
+def test_description_tells_the_number_of_rows_and_the_time_steps(load):
+    regular = load(table_of(np.arange(0.0, 8.0, 0.01)))
+    assert "transitions, each over 1 recorded row (0.01 s), not filtered" in log_transitions(regular).DESCR
+    found = log_transitions(load(table_of(T)), stride=2)
+    dt = found.data[:, -1]
+    assert f"{len(dt)} transitions, each over 2 recorded rows ({dt.min():.4g} to {dt.max():.4g} s)" in found.DESCR
 
 
 def test_some_transition_must_remain(load):
