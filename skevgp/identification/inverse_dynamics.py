@@ -571,7 +571,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_is_fitted(self)
         if self._n_moves < FEWEST_MOVES:
             raise ValueError(
-                f"{method} compares moves. Call fit with at least {FEWEST_MOVES} groups; got {self._n_moves}."
+                f"{method} compares moves. Call fit with at least {FEWEST_MOVES} groups; got {self._n_moves}. With "
+                "load_log, one file is one group."
             )
         rows_x, targets = self._new_log(X, y)
         rows = self._as_rows(rows_x, targets, None, pieces)
