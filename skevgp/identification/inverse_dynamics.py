@@ -80,8 +80,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     learn_scales : bool, default=True
         Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
-        it. Factors are from 1e-4 to 1e4. With ``gain_scale``, that of inertial parameters is at least 1: torques do
-        not show a common error of masses and gains.
+        it. Factors of friction are from 1e-4 to 1e4, that of inertial parameters from 1 to 1e4.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -571,7 +570,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_is_fitted(self)
         if self._n_moves < FEWEST_MOVES:
             raise ValueError(
-                f"{method} compares moves. Call fit with at least {FEWEST_MOVES} groups; got {self._n_moves}."
+                f"{method} compares moves. Call fit with at least {FEWEST_MOVES} groups; got {self._n_moves}. With "
+                "load_log, one file is one group."
             )
         rows_x, targets = self._new_log(X, y)
         rows = self._as_rows(rows_x, targets, None, pieces)

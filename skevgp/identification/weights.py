@@ -271,15 +271,13 @@ class _Problem:
         if self.prior.groups is None or self.prior.learned:
             return factors
         p = len(self.prior.scaled)
-        unknown_gains = len(self.prior.mean) > p
         for group in dict.fromkeys(self.prior.groups):
             if group:
                 own = self.prior.groups == group
                 n, total = own.sum(), squares[own].sum() * factors[own][0] ** 2
-                # With unknown gains, torques do not show the scale of all masses. Small errors of what they do show
-                # must not make that scale certain, and gains with it.
-                scaled = unknown_gains and self.prior.scaled[own[:p]].any()
-                least = 0.0 if scaled else -_WIDEST
+                # Rows determine some combinations of inertial parameters only. Small errors of these must not narrow
+                # the prior of the others. With unknown gains, the scale of all masses is one of the others.
+                least = 0.0 if self.prior.scaled[own[:p]].any() else -_WIDEST
                 # -n + total / t² - log t falls with log t. It is 0 at the best t, or beyond the limits of t.
                 low, high = (total * np.exp(-2.0 * edge) - n - edge for edge in (least, _WIDEST))
                 best = least if low <= 0.0 else _WIDEST

@@ -521,7 +521,7 @@ class Function(Map):
         if function in self._IN_CASADI and not self.transformer.kw_args:
             return getattr(casadi(), self._IN_CASADI[function])(x)
         raise NoExpressionError(
-            f"{self.transformer!r} cannot be written in CasADi, as functions of NumPy on their own can be "
-            f"({', '.join(known.__name__ for known in self._IN_CASADI)}). Write a transformer with a method "
+            f"{self.transformer!r} cannot be written in CasADi. Only these NumPy functions can be exported: "
+            f"{', '.join(known.__name__ for known in self._IN_CASADI)}. For others, write a transformer with a method "
             "to_casadi(x)."
         )

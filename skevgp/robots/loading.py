@@ -232,7 +232,7 @@ def _axis(joint: Any) -> np.ndarray:
 
 
 def urdf_path(robot: str | os.PathLike[str]) -> Path:
-    """The URDF file of a name or path, or an error that lists the known names."""
+    """The URDF file of a name or path, or an error, which lists the known names if it may be a name."""
     names = _collection()
     if isinstance(robot, str) and robot in names:
         return names[robot]
@@ -243,7 +243,9 @@ def urdf_path(robot: str | os.PathLike[str]) -> Path:
         raise ValueError(f"{str(path)!r} is a folder; a robot is one URDF file.")
     if not isinstance(robot, str):
         raise ValueError(f"There is no file {str(path)!r}; a robot's name must be a string, not a path.")
-    if path.suffix or len(path.parts) > 1:
+    if path.suffix == ".urdf" or len(path.parts) > 1:
+        raise ValueError(f"There is no file {str(path)!r}.")
+    if path.suffix:  # a file, or a name such as alexander_v1.lowerBodyOnly
         raise ValueError(f"There is no file {str(path)!r}; the names that are known are {list_robots()}.")
     known = {name.lower(): name for name in list_robots()}
     close = [repr(known[name]) for name in get_close_matches(robot.lower(), known, n=3)]

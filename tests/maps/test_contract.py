@@ -282,7 +282,7 @@ BY_DIFFERENCES = {
     *(name for name in THETA if name.startswith("linearised")),
 }
 WITHOUT_EXPRESSION = {
-    "function": "cannot be written in CasADi, as functions of NumPy",
+    "function": r"cannot be written in CasADi\. Only these NumPy functions can be exported: sin, ",
     "pipeline, unknown step": r"Normalizer\(\) cannot be written in CasADi\. These can be exported: AngleEncoder,",
     "union, unknown part": r"Normalizer\(\) cannot",
     "columns, unknown part": r"Normalizer\(\) cannot",

@@ -239,9 +239,10 @@ def test_motor_works_between_both_limits(lower, upper, driven, limits):
     ("robot", "message"),
     [
         ("bad.urdf", r"bad.urdf' is not a URDF that can be read"),
-        ("nothing.urdf", r"There is no file '.*the names that are known"),
-        ("some/where", r"There is no file '.*the names that are known"),
-        ("~nobody-of-this-name/a.urdf", r"There is no file '.*the names that are known"),
+        ("nothing.urdf", r"^There is no file '[^']*'\.$"),
+        ("nothing.xml", r"There is no file '.*the names that are known"),
+        ("some/where", r"^There is no file '[^']*'\.$"),
+        ("~nobody-of-this-name/a.urdf", r"^There is no file '[^']*'\.$"),
         (Path("folder"), r"is a folder; a robot is one URDF file"),
         ("", "Unknown robot ''"),
         (Path("panda"), r"no file 'panda'; a robot's name must be a string, not a path"),
