@@ -102,14 +102,19 @@ def test_rows_left_out_are_predicted_from_the_others():
     assert np.isfinite(whole.torques).all()
 
 
-def test_unknown_gains_keep_the_prior_of_masses():
-    rows, prior, beta = problem(n=600, gains=np.array([1.1, 0.9]))
-    prior = replace(prior, mean=beta, covariance=np.eye(4), groups=np.array(["inertia"] * 4, dtype=object))
-    # Weights are the prior mean: with known gains the learned scale is small.
-    known = identify(replace(rows, targets=rows.features @ beta + 0.1), prior)
-    unknown = identify(rows, with_gains(prior, 2, 0.2))
-    assert known.factors.max() < 0.5
-    assert_allclose(unknown.factors, 1.0)
+@pytest.mark.parametrize("gains", [None, np.array([1.1, 0.9])])
+def test_prior_of_masses_is_never_narrowed(gains):
+    rows, prior, beta = problem(n=600, p=5, gains=gains, scaled=3)
+    groups = np.array(["inertia"] * 3 + ["friction"] * 2, dtype=object)
+    # The weights are the prior mean, so that the learned scales would be small.
+    prior = replace(prior, mean=beta, covariance=np.eye(5), groups=groups)
+    prior = prior if gains is None else with_gains(prior, 2, 0.2)
+    found = identify(rows, prior)
+    assert_allclose(found.factors[:3], 1.0)
+    assert found.factors[3:5].max() < 0.5
+    # They get wider if the weights are far from the prior mean.
+    narrow = replace(prior, mean=prior.mean + 1.0, covariance=0.01 * prior.covariance)
+    assert identify(rows, narrow).factors[:5].min() > 3.0
 
 
 def test_more_weights_change_nothing_where_their_columns_are_zero():
