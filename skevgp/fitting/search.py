@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # In nats. With a smaller difference, rounding decides whether a white kernel or noise has the higher bound.
 _WORTH = 0.01
+# In nats. More rows show that a column matters if its first length scale raises the bound by more.
+_SEEN = 1.0
 # Share of the mean noise variance. A signal this small costs almost nothing, and its gradient shows if it should grow.
 _LITTLE = 1e-4
 # Largest number of floats of a sample. Samples are held in memory.
@@ -76,9 +78,9 @@ class Rules:
     # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
     # `LARGEST_SAMPLE`, are left out.
     growth: int = 4
-    # In a fit to more rows, length scales of columns start at most at so many times the first ones. A small sample may
-    # not show that a column matters, and the gradient of a long length scale is almost 0.
-    longest: float = 10.0
+    # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
+    # first ones. A small sample may not show that a column matters.
+    longest: float = 3.0
     # A restart multiplies the first values by random numbers between 1 / factor and the factor, log-uniformly.
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
@@ -249,23 +251,37 @@ class Search:
         stage, samples = self.rules.stage, self.model.samples
         if stage is None or not samples or self.max_iter == 0:
             return self._stages(values, self.max_iter)
-        few, most = min(2 * stage, self.max_iter), self.rules.longest * values["hyperparameters"]
-        most = np.where(self.model.are_lengthscales, most, np.inf)
-
-        def shortened(fit: Fit) -> Values:
-            return fit.values | {"hyperparameters": np.minimum(fit.values["hyperparameters"], most)}
-
+        few = min(2 * stage, self.max_iter)
         best = self._stages(values, few, samples[0])
         for n_rows in samples[1:]:
             if self.collapsed(best):
                 best = self._stages(values, few, n_rows)
             else:
-                best = self._fit(Start(shortened(best), self.max_iter, n_rows=n_rows))
+                best = self._fit(Start(self._shortened(best, values, n_rows), self.max_iter, n_rows=n_rows))
         if not self.collapsed(best):
-            best = self._fit(Start(shortened(best), self.max_iter))
+            best = self._fit(Start(self._shortened(best, values), self.max_iter))
             if not self.collapsed(best):
                 return best
         return better(best, self._stages(values, self.max_iter))
+
+    def _shortened(self, fit: Fit, first: Values, n_rows: int | None = None) -> Values:
+        """The values of a fit to fewer rows, with the first length scales of columns that more rows show to matter."""
+        # The gradient of a long length scale is almost 0, so that an optimiser does not shorten it. One column after
+        # another is tried, and stays short if that raises the bound.
+        name, values = "hyperparameters", fit.values
+        long = (values[name] > self.rules.longest * first[name]) & self.model.are_lengthscales
+        long &= self.table[name].free.reshape(long.shape)
+        columns = np.flatnonzero(long.any(axis=tuple(range(long.ndim - 1))))
+        if len(columns) == 0:
+            return values
+        bound = self.model.minimise(Start(values, 0, n_rows=n_rows, cold=True)).bound
+        for column in columns:
+            own = long & (np.arange(long.shape[-1]) == column)
+            trial = values | {name: np.where(own, first[name], values[name])}
+            tried = self.model.minimise(Start(trial, 0, n_rows=n_rows, cold=True))
+            if tried.bound > bound + _SEEN:
+                values, bound = trial, tried.bound
+        return values
 
     def _stages(self, values: Values, max_iter: int, n_rows: int | None = None) -> Fit:
         """Fit in stages: after the first iterations, inducing points are placed again under the learned kernel."""

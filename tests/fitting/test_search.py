@@ -20,10 +20,10 @@ OWN = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_nois
 PLACES = np.arange(4.0).reshape(1, 2, 2)
 
 
-def table(noise_fixed=False, kernel_fixed=False, widest_signal=None):
+def table(noise_fixed=False, kernel_fixed=False, widest_signal=None, n_columns=2):
     return ParameterTable(
         [
-            Parameter("hyperparameters", np.array([2.0, 3.0]), "log", 1e-3, 1e3, fixed=kernel_fixed),
+            Parameter("hyperparameters", np.arange(2.0, 2.0 + n_columns), "log", 1e-3, 1e9, fixed=kernel_fixed),
             Parameter("signal", np.ones(2), "log", 1e-3, 1e3, widest=widest_signal),
             Parameter("noise", np.full(2, 1e-4), "log", 1e-10, 1e2, fixed=noise_fixed),
             Parameter("inducing_points", PLACES),
@@ -44,7 +44,9 @@ def model(**changes):
         "alone": FeaturesAlone(),
         "interpolates": False,
         "samples": (),
-        "are_lengthscales": np.array([True, False]),
+        "are_lengthscales": np.array([True, True, False])[
+            : len(changes.get("table", table())["hyperparameters"].start)
+        ],
         "place": None,
         "warm": None,
         "placed": False,
@@ -212,13 +214,20 @@ def test_fit_climbs_from_sample_to_sample_to_all_rows():
     assert (best.bound, best.n_rows) == (2.0, None)
 
 
-def test_length_scales_are_shortened_before_a_fit_to_more_rows():
-    own = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000))
-    made, best = drive(own, (5.0, {"stretch": 1e3}), (4.0, {"stretch": 1e3}), (3.0, {"stretch": 1e3}))
-    lengths, others = np.array([start.values["hyperparameters"] for start in made]).T
-    np.testing.assert_allclose(lengths, [2.0, 20.0, 20.0])  # at most 10 times the first one
-    np.testing.assert_allclose(others, [3.0, 3e3, 3e6])
-    np.testing.assert_allclose(best.values["hyperparameters"], [2e4, 3e9])
+def test_columns_that_more_rows_show_to_matter_get_their_first_length_scale():
+    three = {"table": table(n_columns=3), "are_lengthscales": np.array([True, True, False])}
+    own, far = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000), **three), {"stretch": 1e3}
+    # A fit to the sample. Then the bound where it ended, and with each of two columns shorter: only the second is worth
+    # it. The third hyperparameter is not a length scale. On all rows, neither is.
+    tries = [(7.0, GOOD), (7.5, GOOD), (9.0, GOOD)]
+    made, best = drive(own, (5.0, far), *tries, (4.0, GOOD), (3.0, GOOD), (3.5, GOOD), (2.0, GOOD))
+    assert [start.until for start in made] == [200, 0, 0, 0, 1000, 0, 0, 1000]
+    assert [start.n_rows for start in made] == [1000, 4000, 4000, 4000, 4000, None, None, None]
+    lengths = [start.values["hyperparameters"] for start in made]
+    long, short = [2e3, 3e3, 4e3], [2e3, 3.0, 4e3]
+    np.testing.assert_allclose(lengths[1:5], [long, [2.0, 3e3, 4e3], short, short])
+    np.testing.assert_allclose(lengths[5:], [short, [2.0, 3.0, 4e3], short])
+    np.testing.assert_allclose(best.values["hyperparameters"], short)
 
 
 def test_collapse_on_all_rows_restarts():
