@@ -455,6 +455,16 @@ def warnings_of(X, y, **data):
     return [str(one.message) for one in caught]
 
 
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_robot_at_rest_with_equal_rows_is_fitted():
+    X = np.repeat([0.1, 0.0, 0.0], 6) * np.ones((1000, 1))
+    y = RigidBodyRegressor("ur5").fit_transform(X) @ RigidBodyRegressor("ur5").fit(X).coef_prior(6)[0]
+    model = InverseDynamics("ur5", random_state=0).fit(X, y.round(2), groups=np.arange(1000) // 250)
+    mean, std = model.predict(X[:1], return_std=True)
+    assert_allclose(mean, y[:1], atol=0.02)
+    assert ((std > 0.0) & (std < 1.0)).all()
+
+
 def test_weaknesses_of_a_log_are_named():
     arm = Arm("acrobot", error=0.05)
     assert warnings_of(arm.X, arm.y, groups=arm.groups) == []
@@ -462,6 +472,7 @@ def test_weaknesses_of_a_log_are_named():
     still[:, [1, 3, 5]] = [0.3, 0.0, 0.0]
     said = warnings_of(still, arm.torque(still) + 0.02 * np.random.default_rng(0).normal(size=arm.y.shape))
     assert any(one.startswith("['q2'] never move") for one in said)
+    assert not any("opposite sign" in one for one in said)
     said = warnings_of(arm.X, arm.y * [0.01, 1.0], groups=arm.groups)
     assert any(one.startswith("Torques of ['q1'] are at most") for one in said)
     said = warnings_of(arm.X, arm.y * [1.0, -1.0], groups=arm.groups)

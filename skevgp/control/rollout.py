@@ -21,14 +21,13 @@ Controller = Callable[[np.ndarray, int], ArrayLike]
 _METHODS = ("sample", "linearized", "mean")
 _NOISES = ("learned", "none")
 _REMEDY = (
-    "The model is unstable there, or they left the training data. Use more inducing points, more data, fewer steps, or "
-    'method="linearized".'
+    "The model is unstable there, or they left the training data. Use more inducing points, more data, or fewer steps."
 )
 # Width of finite differences, as a share of the standard deviations.
 _SHARE = 0.01
-# Particles run away if a standard deviation is larger than the interquartile range by this factor. That of a normal
-# distribution is 0.74 times its interquartile range.
-_RUNAWAY = 100.0
+# Particles run away if a standard deviation is larger than the interquartile range by the first factor, and than the
+# path of the median by the second. That of a normal distribution is 0.74 times its interquartile range.
+_RUNAWAY, _BEYOND = 100.0, 10.0
 
 
 def rollout(
@@ -62,7 +61,8 @@ def rollout(
         - ``"linearized"``: mean and covariance to first order, with independent steps.
         - ``"mean"``: each step starts from the mean of the step before.
     process_noise : {"learned", "none"}, default="learned"
-        Whether to add the learned noise at each step. Use ``"none"`` if it is noise of the measurement.
+        Whether to add the learned noise at each step. With ``"none"``, only the uncertainty of the function counts. If
+        states are noisy, its intervals are often too narrow, and those of ``"learned"`` may be too wide.
     random_state : int, RandomState instance or None, default=None
         Seed of the particles.
 
@@ -86,7 +86,8 @@ def rollout(
     Warns
     -----
     UnstableRolloutWarning
-        If a few particles run away, and dominate mean and standard deviation.
+        If particles run away, up to a quarter of them, and dominate mean and standard deviation. With less than five
+        samples, there is no warning.
 
     Notes
     -----
@@ -219,7 +220,7 @@ def _sampled(
             paths[own, t], inputs[own, t] = z, u
     samples = paths.reshape(len(batch), n_samples, n_steps, n_states)
     mean = samples.mean(axis=1)
-    _warn_of_runaways(samples)
+    _warn_of_runaways(samples, batch)
     deviations = np.moveaxis(samples - mean[:, np.newaxis], 1, 3)  # (batch, steps, states, samples)
     covariance = deviations @ np.swapaxes(deviations, 2, 3) / max(n_samples - 1, 1)
     found = {"mean": mean, "std": np.sqrt(np.einsum("btii->bti", covariance)), "covariance": covariance}
@@ -318,18 +319,21 @@ def _within_limits(values: np.ndarray, t: int, of: str = "rollouts") -> np.ndarr
     return values
 
 
-def _warn_of_runaways(samples: np.ndarray) -> None:
+def _warn_of_runaways(samples: np.ndarray, starts: np.ndarray) -> None:
     """Warn if a few of the samples (n_batch, n_samples, n_steps, n_states) dominate the standard deviation."""
+    # Particles that end in another stable state are also far from the others, but not far from the path so far.
     low, middle, high = np.percentile(samples, [25.0, 50.0, 75.0], axis=1)
     width = high - low
-    large = (samples.std(axis=1) > _RUNAWAY * width) & (width > 0.0)
+    path = np.maximum(np.abs(middle).max(axis=1), np.abs(starts))[:, np.newaxis]
+    large = (samples.std(axis=1) > np.maximum(_RUNAWAY * width, _BEYOND * path)) & (width > 0.0)
     if large.any():
         step = int(np.flatnonzero(large.any(axis=(0, 2)))[0])
         far = np.abs(samples - middle[:, np.newaxis]) > _RUNAWAY * width[:, np.newaxis]
         count = int((far & large[:, np.newaxis]).any(axis=(2, 3)).sum())
         warn_user(
-            f"From step {step} on, {count} of {samples.shape[0] * samples.shape[1]} particles run away, and dominate "
-            f"mean and std. Quantiles of samples describe the others. {_REMEDY}",
+            f"{count} of {samples.shape[0] * samples.shape[1]} particles run away, the first at step {step}, and "
+            f"dominate mean and std. Quantiles of samples describe the others. {_REMEDY} "
+            'method="linearized" stays near the mean.',
             UnstableRolloutWarning,
         )
 

@@ -239,10 +239,9 @@ def feature_report(
     else:
         n_groups = len(np.unique(trajectories))
         if n_groups < n_splits:
-            have = "has one group" if n_groups == 1 else f"has {n_groups} groups"
             raise ValueError(
-                f"groups {have}, but n_splits={n_splits} needs at least {n_splits}. Cut the recording into blocks of a "
-                "few seconds, and pass these as groups."
+                f"n_splits={n_splits} needs at least {n_splits} groups; got {n_groups}. If the rows are one recording, "
+                "cut it into blocks of a few seconds, and pass these as groups."
             )
         splits = list(GroupKFold(n_splits).split(target, groups=trajectories))
     # The whole model first.

@@ -226,6 +226,8 @@ class NominalDynamics(ParametricMap, RobotMap):
         kind, _, joint = name.removesuffix(")").partition("(")
         if kind not in ("damping", "armature") or joint not in ("", *self._layout.position_names):
             return ""
+        if not joint and self._layout.n_joints == 1:
+            return ""  # the list of parameters has it
         of_joint = f"joint {joint!r}" if joint else "any joint"
         instead = " Add Friction(robot) to the features, which learns it." if kind == "damping" else ""
         return f" The model of the robot has no {kind} above 0 for {of_joint}.{instead}"

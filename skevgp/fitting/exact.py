@@ -66,7 +66,7 @@ class ExactTask:
     # Only sparse models have samples and inducing points.
     interpolates: ClassVar[bool] = True
     samples: ClassVar[tuple[int, ...]] = ()
-    are_lengthscales: ClassVar[bool] = False
+    lengthscale_mask: ClassVar[bool] = False
     placed: ClassVar[bool] = True
     place: ClassVar[None] = None
 

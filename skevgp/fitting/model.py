@@ -245,9 +245,9 @@ class Model:
         return () if self.interpolates else self.rules.samples(len(self.rows), self.n_inducing + p, width)
 
     @property
-    def are_lengthscales(self) -> np.ndarray:
+    def lengthscale_mask(self) -> np.ndarray:
         """Whether each hyperparameter is the length scale of one of several columns, (n_hyper,)."""
-        return self.problem.spec.covariance.are_lengthscales
+        return self.problem.spec.covariance.lengthscale_mask
 
     @cached_property
     def _sample(self) -> Rows:

@@ -269,7 +269,7 @@ class Search:
         # The gradient of a long length scale is almost 0, so that an optimiser does not shorten it. One column after
         # another is tried, and stays short if that raises the bound.
         name, values = "hyperparameters", fit.values
-        long = (values[name] > self.rules.longest * first[name]) & self.model.are_lengthscales
+        long = (values[name] > self.rules.longest * first[name]) & self.model.lengthscale_mask
         long &= self.table[name].free.reshape(long.shape)
         columns = np.flatnonzero(long.any(axis=tuple(range(long.ndim - 1))))
         if len(columns) == 0:

@@ -25,8 +25,6 @@ LOWEST_NOISE = 1e-20
 # Limits of the factors of the standard deviations of groups of weights.
 _FACTOR_LIMITS = 1e-4, 1e4
 _NEIGHBOUR_SAMPLE = 2000
-# Relative size of rounding errors in columns. Differences of ten thousand times lose these digits, as steps of a clock.
-_ROUNDING = 1e-11
 
 
 def column_centre(inputs: Moments) -> np.ndarray:
@@ -46,8 +44,8 @@ def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance
 
 
 def _constant(inputs: Moments) -> np.ndarray:
-    """Whether the entries (d,) of a column differ by rounding errors only."""
-    return inputs.highest - inputs.lowest <= _ROUNDING * inputs.largest
+    """Whether the entries (d,) of a column differ by a few rounding errors only."""
+    return inputs.highest - inputs.lowest <= 8.0 * np.finfo(float).eps * inputs.largest
 
 
 def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:

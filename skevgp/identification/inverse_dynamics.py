@@ -318,25 +318,24 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         if not is_far and not causes:
             return ""
         named = "".join(f"{cause[0].upper()}{cause[1:]}. " for cause in causes)
-        little = ""
+        little = self._furthest(y.shape[1])
         if self._unexplained:
-            little = f" Less than half of the variance of the torques of {self._unexplained} is explained."
+            little += f" Less than half of the variance of the torques of {self._unexplained} is explained."
         return (
             f"The robot's model does not fit the torques. {named}{'Otherwise, its' if causes else 'Its'} masses may be "
             "placeholders, or y may have other units. "
             f"Give {'' if self.learn_scales else 'RigidBodyRegressor wider scales, or '}y in N m. The weights are "
-            f"{self._weights.surprise:.1f} prior standard deviations from the model, mostly "
-            f"{self._furthest(y.shape[1])}.{little}"
+            f"{self._weights.surprise:.1f} prior standard deviations from the model.{little}"
         )
 
     def _furthest(self, n_outputs: int) -> str:
-        """Return the names of the weights that are furthest from the robot's model, in its standard deviations."""
+        """Return a sentence with the weights that are furthest from the robot's model, in its standard deviations."""
         names, weights = self._names(n_outputs), self._weights
         n = len(names)
         scale = np.sqrt(np.diag(weights.prior.covariance))[:n] / weights.factors[:n]
         change = np.abs(weights.mean - weights.prior.mean)[:n] / np.where(scale > 0.0, scale, np.inf)
-        largest = [str(names[at]) for at in np.argsort(-change)[:_MOST_NAMED]]
-        return f"{', '.join(largest[:-1])} and {largest[-1]}" if len(largest) > 1 else largest[0]
+        largest = [str(names[at]) for at in np.argsort(-change)[:_MOST_NAMED] if change[at] > 1.0]
+        return f" The largest changes are those of {', '.join(largest)}." if largest else ""
 
     def _check_columns_of_y(self, y: ArrayLike) -> None:
         """Raise ValueError for a data frame with the robot's joints in another order."""

@@ -117,7 +117,7 @@ def fit_joint_residual(
         z = terms(speed, physics, found.velocity)
         effects, update, found = variation(z, missed, speed, found, own, rows)
         squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own + known)
-        logs = [np.log(np.mean(squares[rows.groups == move])) for move in np.unique(rows.groups)]
+        logs = [np.log(max(float(np.mean(squares[rows.groups == move])), 1e-300)) for move in np.unique(rows.groups)]
         return JointResidual(model, found, share, effects, update, effects, np.array(logs))
 
     size, least = float(np.mean(residual**2)), _LEAST * noise.variance

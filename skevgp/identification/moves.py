@@ -14,6 +14,8 @@ from .weights import Rows
 EFFECTS = ("offset", "viscous", "coulomb", "gain")
 # Least number of moves to find out how moves differ.
 FEWEST_MOVES = 3
+# Least variance within held-out moves, as a share of that of noise. Rows of a robot at rest may be equal.
+_LEAST = 1e-12
 # Steps of expectation maximisation.
 _STEPS = 50
 # Shares of the variances that an update may use, and the part of a move that tests of updates use.
@@ -62,7 +64,8 @@ def variation(
     within = np.empty_like(missed)
     for own in moves:
         within[own] = _without_effects(z[own] / std[own, np.newaxis], missed[own] / std[own])
-    share = min(1.0, float(np.sum(within**2) / max(1, len(within) - z.shape[1] * len(moves))))
+    share = float(np.sum(within**2) / max(1, len(within) - z.shape[1] * len(moves)))
+    share = min(1.0, max(_LEAST, share))
     scale = std * np.sqrt(share * correlation_time(within, rows.runs))
     informations = [_information(z[own], missed[own], scale[own]) for own in moves]
     size = np.mean(z**2, axis=0)

@@ -1,4 +1,4 @@
-"""Warnings about logs: joints at rest, joints without a motor, torques of the other sign, little motion."""
+"""Warnings about logs: joints at rest, joints without a motor, torques of the opposite sign, little motion."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .weights import Rows, Weights
 
 # A joint counts as not driven if its torque is below this share of the torque of the robot's model.
 _NOT_DRIVEN = 0.1
-# Torques have the other sign if their correlation with those of the robot's model is below it.
+# Torques have the opposite sign if their correlation with those of the robot's model is below it.
 _OPPOSED = -0.5
 # A joint counts as at rest if its speed is always lower, rad/s or m/s.
 _REST = 0.01
@@ -39,7 +39,7 @@ def weaknesses(rows: Rows, weights: Weights, n_coef: int, names: list[str]) -> l
             "If the motors were off, predictions will be wrong when they are on. Otherwise, y may have another unit, "
             "or the masses of the robot's model may be far too large."
         )
-    opposed = (_correlation(of_model, rows.targets) < _OPPOSED) & ~idle
+    opposed = (_correlation(of_model, rows.targets) < _OPPOSED) & ~idle & ~still
     if opposed.any():
         said.append(
             f"Torques of {_of(names, opposed)} have the opposite sign to those of the robot's model. Check the signs "
@@ -59,8 +59,11 @@ def weaknesses(rows: Rows, weights: Weights, n_coef: int, names: list[str]) -> l
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the correlation (o,) of columns (n, o), or 0 if one of them is constant."""
-    one, other = one - one.mean(axis=0), other - other.mean(axis=0)
+    """Return the correlation (o,) of columns (n, o), or 0 if one of them is constant up to rounding."""
+    one, other = (
+        np.where(np.ptp(column, axis=0) > 1e-10 * np.abs(column).max(axis=0), column - column.mean(axis=0), 0.0)
+        for column in (one, other)
+    )
     size = np.sqrt(np.sum(one**2, axis=0)) * np.sqrt(np.sum(other**2, axis=0))
     product: np.ndarray = np.sum(one * other, axis=0) / np.where(size > 0.0, size, 1.0)
     return product

@@ -178,7 +178,7 @@ class Covariance(ABC):
         """Number of hyperparameters."""
 
     @property
-    def are_lengthscales(self) -> np.ndarray:
+    def lengthscale_mask(self) -> np.ndarray:
         """Whether each hyperparameter is the length scale of one of several columns, (n_hyper,)."""
         return np.zeros(self.n_hyperparameters, dtype=bool)
 
@@ -236,8 +236,8 @@ class _Combination(Covariance):
         return sum(part.n_hyperparameters for part in self.parts)
 
     @property
-    def are_lengthscales(self) -> np.ndarray:
-        return np.concatenate([part.are_lengthscales for part in self.parts])
+    def lengthscale_mask(self) -> np.ndarray:
+        return np.concatenate([part.lengthscale_mask for part in self.parts])
 
     @property
     def preparations(self) -> tuple[Preparation, ...]:

@@ -357,7 +357,7 @@ class Stationary(Covariance):
         return self.profile.n_parameters + (1 if self.isotropic else self.n_columns)
 
     @property
-    def are_lengthscales(self) -> np.ndarray:
+    def lengthscale_mask(self) -> np.ndarray:
         own = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
         return own & (not self.isotropic)
 

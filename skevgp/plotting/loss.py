@@ -84,7 +84,7 @@ class LossDisplay:
             If there are no iterations, for example after ``max_iter=0``.
         """
         check_fitted(estimator)
-        if isinstance(estimator, Pipeline):
+        while isinstance(estimator, Pipeline):
             estimator = estimator[-1]
         bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
         bound[~np.isfinite(bound)] = np.nan  # a user's optimizer may have tried points that cannot be evaluated

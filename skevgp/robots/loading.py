@@ -244,7 +244,8 @@ def urdf_path(robot: str | os.PathLike[str]) -> Path:
     if not isinstance(robot, str):
         raise ValueError(f"There is no file {str(path)!r}; a robot's name must be a string, not a path.")
     if path.suffix == ".urdf" or len(path.parts) > 1:
-        raise ValueError(f"There is no file {str(path)!r}.")
+        own = path.stem in names
+        raise ValueError(f"There is no file {str(path)!r}.{f' {path.stem!r} is the name of a robot.' if own else ''}")
     if path.suffix:  # a file, or a name such as alexander_v1.lowerBodyOnly
         raise ValueError(f"There is no file {str(path)!r}; the names that are known are {list_robots()}.")
     known = {name.lower(): name for name in list_robots()}

@@ -271,10 +271,27 @@ class Escape(BaseEstimator):
 
 
 def test_particles_that_run_away_raise_a_warning():
-    # After the first step particles are N(1.45, 1), so that about 6 % of them pass 3.
+    # After the first step particles are N(1.45, 1), so that about 6 % of them pass 3. Others follow.
     model = Escape().fit(np.zeros((2, 2)), np.zeros(2))
-    with pytest.warns(UnstableRolloutWarning, match=r"of 100 particles run away") as caught:
+    with pytest.warns(
+        UnstableRolloutWarning, match=r"\d+ of 100 particles run away, the first at step \d+, "
+    ) as caught:
         ahead = rollout(model, [2.9], np.zeros((60, 1)), random_state=0)
     assert len(caught) == 1
     assert ahead.std[-1] > 1e6
     rollout(model, [2.9], np.zeros((3, 1)), random_state=0)
+
+
+class Bistable(Escape):
+    """Steps of ẋ = x - x³, with the stable states -1 and 1."""
+
+    def predict(self, X, return_std=False):
+        z = X[:, :1]
+        return z + 0.2 * (z - z**3), np.full_like(z, 0.003)
+
+
+def test_particles_in_another_stable_state_do_not_run_away():
+    # A seventh ends at -1, the others at 1 with a spread of about 0.01.
+    ahead = rollout(Bistable().fit(np.zeros((2, 2)), np.zeros(2)), [0.006], np.zeros((80, 1)), random_state=0)
+    assert 5 < (ahead.samples[:, -1, 0] < -0.9).sum() < 25
+    assert ahead.std[-1, 0] > 30.0 * np.subtract(*np.percentile(ahead.samples[:, -1, 0], [75, 25]))

@@ -44,9 +44,7 @@ def model(**changes):
         "alone": FeaturesAlone(),
         "interpolates": False,
         "samples": (),
-        "are_lengthscales": np.array([True, True, False])[
-            : len(changes.get("table", table())["hyperparameters"].start)
-        ],
+        "lengthscale_mask": np.array([True, False]),
         "place": None,
         "warm": None,
         "placed": False,
@@ -215,7 +213,7 @@ def test_fit_climbs_from_sample_to_sample_to_all_rows():
 
 
 def test_columns_that_more_rows_show_to_matter_get_their_first_length_scale():
-    three = {"table": table(n_columns=3), "are_lengthscales": np.array([True, True, False])}
+    three = {"table": table(n_columns=3), "lengthscale_mask": np.array([True, True, False])}
     own, far = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000), **three), {"stretch": 1e3}
     # A fit to the sample. Then the bound where it ended, and with each of two columns shorter: only the second is worth
     # it. The third hyperparameter is not a length scale. On all rows, neither is.

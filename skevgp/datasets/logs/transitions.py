@@ -93,6 +93,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     if not any(lengths):
         raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest. Lower stride={stride}.")
     rows, n = np.vstack(parts), len(log.joint_names)
+    latest = max(abs(recording.start) + float(recording.raw.time[-1]) for recording in log.recordings)
+    rows[:, 3 * n] = _rounded(rows[:, 3 * n], latest)
     data, target, time = rows[:, : 3 * n + 1], rows[:, 3 * n + 1 : -1], rows[:, -1]
     if return_X_y:
         return data, target
@@ -106,7 +108,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
         feature_names=[*states, *log.target_names, "dt"],
         target_names=states,
         DESCR=(
-            f"{len(data)} transitions, each over {stride} recorded row{'s' if stride > 1 else ''} "
+            f"{len(data)} transitions, each over {stride} time step{'s' if stride > 1 else ''} of the recording "
             f"({_span(data[:, -1])} s), not filtered, without gaps, jumps and rest, of the files "
             f"{', '.join(log.filenames)}."
         ),
@@ -117,6 +119,12 @@ def _span(dt: np.ndarray) -> str:
     """Return the shortest and the longest time step in s, or one number if they are about the same."""
     shortest, longest = f"{dt.min():.4g}", f"{dt.max():.4g}"
     return shortest if shortest == longest else f"{shortest} to {longest}"
+
+
+def _rounded(steps: np.ndarray, latest: float) -> np.ndarray:
+    """Return time steps without the rounding errors of the times, which are at most the latest."""
+    # Steps of a regular clock would differ by rounding errors, and a kernel may learn a length scale of their size.
+    return np.round(steps, max(0, int(-np.log10(2.0 * np.spacing(max(latest, 1.0))))))
 
 
 def _transitions(recording: Bunch, stride: int) -> np.ndarray:

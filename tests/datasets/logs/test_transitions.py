@@ -38,6 +38,13 @@ def test_row_is_a_recorded_state_with_its_torque_and_the_time_to_the_next(load):
     assert_allclose(found.time, T[:-1] - T[0], atol=1e-10)
 
 
+@pytest.mark.parametrize(("start", "n_rows"), [(0.0, 2000), (1e5, 400), (1.7e9, 400)])
+def test_steps_of_a_regular_clock_are_equal(load, start, n_rows):
+    table = table_of(0.01 * np.arange(n_rows))
+    table[:, 0] += start
+    assert_array_equal(np.unique(log_transitions(load(table)).data[:, -1]), [0.01])
+
+
 @pytest.mark.parametrize("stride", [2, 5])
 def test_with_a_stride_states_follow_each_other_and_torques_are_means(load, stride):
     states, torques, dt, then = parts(log_transitions(load(table_of(T)), stride=stride))
@@ -81,10 +88,10 @@ def test_velocities_must_be_recorded(load):
 
 def test_description_tells_the_number_of_rows_and_the_time_steps(load):
     regular = load(table_of(np.arange(0.0, 8.0, 0.01)))
-    assert "transitions, each over 1 recorded row (0.01 s), not filtered" in log_transitions(regular).DESCR
+    assert "transitions, each over 1 time step of the recording (0.01 s), not filtered" in log_transitions(regular).DESCR
     found = log_transitions(load(table_of(T)), stride=2)
     dt = found.data[:, -1]
-    assert f"{len(dt)} transitions, each over 2 recorded rows ({dt.min():.4g} to {dt.max():.4g} s)" in found.DESCR
+    assert f"{len(dt)} transitions, each over 2 time steps of the recording ({dt.min():.4g} to {dt.max():.4g} s)" in found.DESCR
 
 
 def test_some_transition_must_remain(load):
