@@ -257,8 +257,8 @@ def test_torques_whose_weights_are_shared_and_correlated():
         ({"y": None}, ValueError, "feature_report needs y with X"),
         ({"n_splits": 1}, ValueError, "n_splits must be at least 2; got 1"),
         ({"n_splits": 2.5}, TypeError, r"n_splits must be an integer; got 2\.5"),
-        ({"groups": [0] * 45 + [1] * 45}, ValueError, "groups has 2 groups, but n_splits=3 needs at least 3"),
-        ({"groups": [0] * 90}, ValueError, "groups has one group.* Cut the recording into blocks of a few seconds"),
+        ({"groups": [0] * 45 + [1] * 45}, ValueError, "n_splits=3 needs at least 3 groups; got 2"),
+        ({"groups": [0] * 90}, ValueError, "needs at least 3 groups; got 1.* cut it into blocks of a few seconds"),
         ({"groups": [0, 1, 2]}, ValueError, r"groups must have the shape \(n_samples,\) = \(90,\)"),
     ],
 )

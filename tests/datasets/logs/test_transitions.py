@@ -88,10 +88,15 @@ def test_velocities_must_be_recorded(load):
 
 def test_description_tells_the_number_of_rows_and_the_time_steps(load):
     regular = load(table_of(np.arange(0.0, 8.0, 0.01)))
-    assert "transitions, each over 1 time step of the recording (0.01 s), not filtered" in log_transitions(regular).DESCR
+    assert (
+        "transitions, each over 1 time step of the recording (0.01 s), not filtered" in log_transitions(regular).DESCR
+    )
     found = log_transitions(load(table_of(T)), stride=2)
     dt = found.data[:, -1]
-    assert f"{len(dt)} transitions, each over 2 time steps of the recording ({dt.min():.4g} to {dt.max():.4g} s)" in found.DESCR
+    assert (
+        f"{len(dt)} transitions, each over 2 time steps of the recording ({dt.min():.4g} to {dt.max():.4g} s)"
+        in found.DESCR
+    )
 
 
 def test_some_transition_must_remain(load):
