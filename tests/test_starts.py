@@ -235,3 +235,13 @@ def test_fit_with_one_parameter_is_restarted():
         solver = LBFGS(n_restarts=n_restarts, callback=lambda number, *_, seen=seen: seen.append(number))
         EVGPRegressor(kernel=kernel, inducing_init=x, solver=solver, noise_cv=None, random_state=0).fit(x, y)
     assert numbers[2].count(1) == 3 * numbers[0].count(1) > 0
+
+
+def test_column_that_a_sample_misses_is_learned():
+    """Noise of the size of the signal: on 1000 rows, the wave in the first column looks like noise."""
+    rng = np.random.default_rng(1)
+    X = rng.uniform(-1.0, 1.0, (6000, 6))
+    signal = 2.0 * X[:, 1] + X[:, 2] ** 2 + 0.8 * np.sin(5.0 * X[:, 0])
+    y = signal + rng.standard_normal(6000)
+    model = EVGPRegressor(n_inducing=40, noise_cv=None, random_state=1).fit(X[:5000], y[:5000])
+    assert model.score(X[5000:], signal[5000:]) > 0.95
