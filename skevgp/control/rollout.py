@@ -61,8 +61,8 @@ def rollout(
         - ``"linearized"``: mean and covariance to first order, with independent steps.
         - ``"mean"``: each step starts from the mean of the step before.
     process_noise : {"learned", "none"}, default="learned"
-        Whether to add the learned noise at each step. With ``"none"``, only the uncertainty of the function counts. If
-        states are noisy, its intervals are often too narrow, and those of ``"learned"`` may be too wide.
+        Whether to add the learned noise at each step. With noisy states, intervals are often too narrow with ``"none"``,
+        and may be too wide with ``"learned"``.
     random_state : int, RandomState instance or None, default=None
         Seed of the particles.
 
@@ -86,8 +86,7 @@ def rollout(
     Warns
     -----
     UnstableRolloutWarning
-        If particles run away, up to a quarter of them, and dominate mean and standard deviation. With less than five
-        samples, there is no warning.
+        If at most a quarter of the particles run away, and dominate mean and standard deviation.
 
     Notes
     -----

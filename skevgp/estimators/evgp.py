@@ -134,9 +134,8 @@ class EVGPRegressor(GaussianProcess):
         Factor on the precision of each row: 1 for ordinary rows, and near 0 for outliers. It exists only with
         ``noise="student-t"``.
     lower_bound_, upper_bound_ : float
-        Bounds on the log marginal likelihood in nats, summed over outputs, for the fitted kernel and noise. If they
-        agree, more inducing points do not help this kernel. With ``noise_cv``, noise and signal are the calibrated
-        ones. To compare fits, use ``-loss_curve_[-1]``, or ``noise_cv=None``.
+        Bounds on the log marginal likelihood in nats, summed over outputs, for the fitted kernel and the calibrated
+        noise. If they agree, more inducing points do not help this kernel.
     loss_curve_ : ndarray of shape (n_iter,)
         Minus the lower bound per iteration.
     n_iter_ : int
