@@ -61,8 +61,8 @@ def rollout(
         - ``"linearized"``: mean and covariance to first order, with independent steps.
         - ``"mean"``: each step starts from the mean of the step before.
     process_noise : {"learned", "none"}, default="learned"
-        Whether to add the learned noise at each step. With noisy states, intervals are often too narrow with ``"none"``,
-        and may be too wide with ``"learned"``.
+        Whether to add the learned noise at each step. If states are noisy, intervals are often too narrow with
+        ``"none"``, and may be too wide with ``"learned"``.
     random_state : int, RandomState instance or None, default=None
         Seed of the particles.
 
