@@ -9,8 +9,9 @@ from .weights import Rows, Weights
 
 # A joint counts as not driven if its torque is below this share of the torque of the robot's model.
 _NOT_DRIVEN = 0.1
-# Torques have the opposite sign if their correlation with those of the robot's model is below it.
-_OPPOSED = -0.5
+# Torques have the opposite sign if their correlation with those of the robot's model is below the first number. The
+# standard deviation of those of the model is then at least the second share of theirs: friction may have any sign.
+_OPPOSED, _SIMILAR = -0.5, 0.5
 # A joint counts as at rest if its speed is always lower, rad/s or m/s.
 _REST = 0.01
 # Least number of independent rows for each combination of weights that the rows determine.
@@ -39,7 +40,8 @@ def weaknesses(rows: Rows, weights: Weights, n_coef: int, names: list[str]) -> l
             "If the motors were off, predictions will be wrong when they are on. Otherwise, y may have another unit, "
             "or the masses of the robot's model may be far too large."
         )
-    opposed = (_correlation(of_model, rows.targets) < _OPPOSED) & ~idle & ~still
+    similar = of_model.std(axis=0) >= _SIMILAR * rows.targets.std(axis=0)
+    opposed = (_correlation(of_model, rows.targets) < _OPPOSED) & similar & ~idle & ~still
     if opposed.any():
         said.append(
             f"Torques of {_of(names, opposed)} have the opposite sign to those of the robot's model. Check the signs "
