@@ -408,7 +408,11 @@ class _Calibrator:
             forward, back = (end.gradient.sum(axis=0) - end.z for end in ends if end is not None)
             columns.append(R @ (back - forward) / (2.0 * _DIFFERENCE))
         A = np.array(columns).T
-        return None if np.linalg.svd(A, compute_uv=False).min() < _FLAT else np.linalg.inv(A)
+        if np.linalg.svd(A, compute_uv=False).min() < _FLAT:
+            return None
+        # No direction is less certain than in the prior, where the formula is not valid.
+        U, widths, V = np.linalg.svd(R @ np.linalg.inv(A))
+        return np.linalg.solve(R, U * np.minimum(widths, 1.0) @ V)
 
 
 def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:

@@ -535,6 +535,8 @@ NASTY_MAPS = {
 @example("wave", "few", "little noise", EVGPRegressor, "free", 2)
 @example("wave", "far", "one row", EGPRegressor, "orthogonal", 3)
 @example("imitated by weights", "few", "no noise", EGPRegressor, "free", 40)
+@example("0", "few", "constant", EVGPRegressor, "free", 1)
+@example("of each other", "few", "constant", EVGPRegressor, "orthogonal", 40)
 def test_nasty_data_are_fitted(name, rows, target, kind, discrepancy, n):
     inputs = NASTY_X[rows](n)
     y = NASTY_Y[target](inputs)
