@@ -4,7 +4,7 @@
     python benchmarks/robots.py real --data ../data --quick    # a split per arm, few rows and iterations: a minute
     python benchmarks/robots.py identification                 # 50 runs, each without and with a filter: minutes
     python benchmarks/robots.py identification --quick         # one run of few rows: seconds
-    python benchmarks/robots.py payload --data ../data --seeds 20  # minutes; without --data of simulated arms only
+    python benchmarks/robots.py payload --data ../data         # an hour of one core; without --data only simulated arms
 
 *real* compares models of the torques of real arms. The data folder has a folder of logs per arm. Arms without logs are
 left out. No row of the logs is written anywhere.

@@ -198,7 +198,7 @@ class Predictor:
         It is the same predictor if outputs share their weights, or if those of an output do not determine z.
         """
         o, d, q = K.shape
-        if o == 1 or self.shared or q == 0 or d < q or min(map(np.linalg.matrix_rank, K)) < q:
+        if o == 1 or self.shared or q == 0 or min(map(np.linalg.matrix_rank, K)) < q:
             return self
         # The weights of the last d columns are K (z - ẑ), so that z - ẑ is K⁺ times them, and has the root Δ (k, q).
         # With Δ = Q R, the last q rows of a rotated root can be those of z, and R is the same for all outputs.
