@@ -1,7 +1,5 @@
 """Bad input of all kinds: it is refused by an error that names the cause, or does no harm."""
 
-import warnings
-
 import numpy as np
 import pandas as pd
 import polars as pl
@@ -260,7 +258,7 @@ def test_torques_of_extreme_size_raise(scale, message):
     [
         (1e-150, {}, "^What feature_map returns must be 0 or exceed 1e-140 in size; a column's largest value is"),
         (1e-165, {}, "^What feature_map returns must be 0 or exceed 1e-140 in size; a column's largest value is"),
-        (1e-120, {}, r'^scale="auto" of CoefPrior, the feature map\'s or .*, must not exceed 1e\+100 in size'),
+        (1e-120, {}, r'^scale="auto" of CoefPrior, from the feature map or .*, must not exceed 1e\+100 in size'),
         (
             1e60,
             EXTREME,
@@ -400,12 +398,10 @@ def test_tiny_noise_is_fitted(noise):
 
 
 def test_no_prior_mean_warning_if_features_explain_targets():
-    """Their residuals scatter by rounding, which is little, but so is their mean."""
+    """Their residuals scatter by rounding, which is little, but so is their mean. No intercept is too far away."""
     rng = np.random.RandomState(0)
     rows = rng.randn(10, 5)
-    for normalize_y, told in ((True, False), (False, True)):
+    for normalize_y in (True, False):
         model = EVGPRegressor(PolynomialFeatures(2), normalize_y=normalize_y, random_state=0)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            model.fit(rows, 1e8 + rows[:, 0])
-        assert any("away from its prior mean" in str(each.message) for each in caught) == told
+        model.fit(rows, 1e8 + rows[:, 0])
+        np.testing.assert_allclose(model.predict(rows), 1e8 + rows[:, 0], rtol=1e-12)

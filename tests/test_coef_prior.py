@@ -53,7 +53,8 @@ def in_data(features, targets=TARGETS):
     def left_over(mean):
         return rms(targets - features @ mean.T)
 
-    return InData(wide(features, targets), rms(features), left_over)
+    shape = targets.shape[1], features.shape[1]
+    return InData(shape, lambda: wide(features, targets), rms(features), left_over)
 
 
 def rms(values):
@@ -61,7 +62,7 @@ def rms(values):
 
 
 def wide(features, targets=TARGETS):
-    return wide_scale(rms(features), targets.std(axis=0), np.abs(targets).max(axis=0))
+    return wide_scale(np.linalg.qr(features).R[np.newaxis], len(features), np.abs(targets).max(axis=0))
 
 
 def scale_of(feature_map, features, left_over):
@@ -90,19 +91,34 @@ def test_map_without_an_opinion_gets_a_wide_prior():
     polynomials = PolynomialFeatures(2)
     mean, scale, *_ = resolve(polynomials)
     assert_array_equal(mean, np.zeros((2, 10)))
-    assert_allclose(scale, wide(polynomials.transform(X)))
+    # 1000 times |y| over the part of each feature that the others do not represent.
+    H = polynomials.transform(X)
+    alone = [np.linalg.lstsq(np.delete(H, j, axis=1), H[:, j], rcond=None)[1][0] for j in range(10)]
+    assert_allclose(scale, 1e3 * np.abs(TARGETS).max(axis=0)[:, np.newaxis] * np.sqrt(20.0 / np.array(alone)))
+
+
+def test_wide_scale_is_that_of_a_feature_alone_for_copies_and_zeros():
+    H = np.array([[1.0, 1.0, 0.0]] * 4 + [[-2.0, -2.0, 0.0]] * 4)
+    assert_allclose(wide(H, np.full((8, 1), 3.0)), [3e3 * np.array([1.0, 1.0, np.sqrt(2.5)]) / np.sqrt(2.5)])
+
+
+def test_shared_wide_scale_follows_the_output_that_needs_the_widest():
+    R = np.array([[[3.0, 0.0], [0.0, 4.0]], [[3.0, 0.0], [0.0, 0.0]]])
+    # The second weight is seen in the first output only, where rows are 1e-3 as large.
+    assert_allclose(wide_scale(R, 9.0, np.array([1e-3, 1.0]), shared=True), [[1e3, np.sqrt(2.0) * 0.75]])
 
 
 def test_target_and_a_feature_of_zeros_get_a_finite_scale():
     nothing = FunctionTransformer(np.zeros_like)
-    assert_array_equal(resolve(nothing, targets=np.zeros((20, 1))).scale, [[10.0, 10.0, 10.0]])
+    assert_array_equal(resolve(nothing, targets=np.zeros((20, 1))).scale, [[1e3, 1e3, 1e3]])
 
 
 def test_union_concatenates():
     polynomials = PolynomialFeatures(2)
     mean, scale, *_ = resolve(make_union(InertiaForce("pendulum"), polynomials))
     assert_array_equal(mean, np.hstack([IF_MEAN, np.zeros((2, 10))]))
-    assert_allclose(scale, np.hstack([IF_SCALE, wide(polynomials.fit_transform(X))]))
+    features = np.hstack([X, polynomials.fit_transform(X)])
+    assert_allclose(scale, np.hstack([IF_SCALE, wide(features)[:, 3:]]))
 
 
 def test_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
@@ -115,7 +131,7 @@ def test_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
     assert_array_equal(mean, np.hstack([np.zeros((2, 2)), IF_MEAN]))
     own = features[:, 2:]
     of_inertia = scale_of(InertiaForce("pendulum"), own, rms(TARGETS - own @ IF_MEAN.T))
-    assert_allclose(scale, np.hstack([wide(features[:, :2]), of_inertia]))
+    assert_allclose(scale, np.hstack([wide(features)[:, :2], of_inertia]))
 
 
 def test_weights_of_a_union_are_divided_out():
@@ -124,7 +140,7 @@ def test_weights_of_a_union_are_divided_out():
     )
     mean, scale, *_ = resolve(union)
     assert_allclose(mean, np.hstack([IF_MEAN / 4.0, np.zeros((2, 3))]))
-    assert_allclose(scale, np.hstack([IF_SCALE / 4.0, wide(0.5 * X)]))
+    assert_allclose(scale, np.hstack([IF_SCALE / 4.0, wide(union.transform(X))[:, 3:]]))
 
 
 @pytest.mark.parametrize("name", ["mean", "scale"])

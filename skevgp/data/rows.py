@@ -177,6 +177,14 @@ class LocalSource:
         """The same rows, with ω multiplied by factors (n_rows,), and with log_variance (n_rows,) added to log v."""
         return LocalSource(partial(_reweighted, self.take, factors, log_variance), self.n_rows, self.positions)
 
+    def repeated(self, times: np.ndarray) -> LocalSource:
+        """The same rows with weights w multiplied by ``times`` (n_rows,)."""
+        return LocalSource(partial(_repeated, self.take, times), self.n_rows, self.positions)
+
+    def with_targets(self, targets: np.ndarray) -> LocalSource:
+        """The same rows with other targets (n_rows, o)."""
+        return LocalSource(partial(_with_targets, self.take, targets), self.n_rows, self.positions)
+
     def blocks(
         self,
         make: Callable[[RawRows], AnyBlock],
@@ -196,6 +204,19 @@ class LocalSource:
 
 def _some(take: Callable[[np.ndarray], RawRows], chosen: np.ndarray, rows: slice | np.ndarray) -> RawRows:
     return take(chosen[rows])
+
+
+def _repeated(take: Callable[[slice | np.ndarray], RawRows], times: np.ndarray, rows: slice | np.ndarray) -> RawRows:
+    raw, times = take(rows), times[rows]
+    if raw.counts is None or raw.precision is None:
+        return replace(raw, counts=times, precision=times)
+    return replace(raw, counts=raw.counts * times, precision=raw.precision * times)
+
+
+def _with_targets(
+    take: Callable[[slice | np.ndarray], RawRows], targets: np.ndarray, rows: slice | np.ndarray
+) -> RawRows:
+    return replace(take(rows), targets=targets[rows])
 
 
 def _reweighted(

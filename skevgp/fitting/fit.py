@@ -17,7 +17,7 @@ from ..model.weights import WeightLikelihood
 from ..utils.monitor import Monitor
 from .calibration import calibrated
 from .exact import exact_model_of_sample
-from .messages import far_from_prior, interrupted, signal_gone
+from .messages import far_from_prior, interrupted, many_outliers, signal_gone
 from .model import Model, exact_twin, models_of, parts_of
 from .outliers import RowDoubts, fit_doubting
 from .problem import Problem
@@ -125,7 +125,8 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
             lowest = model.rules.lowest_noise * model.scatter
             noisy = values if exact is None else values | {"noise": np.maximum(values["noise"], lowest)}
             with model.monitor.keeping_the_best():
-                found = calibrated(sparse, noisy, statistics, model.table, model.rows, by, model.seed)
+                rows = model.rows if doubts is None else doubts.without_outliers(model.rows)
+                found = calibrated(sparse, noisy, statistics, model.table, rows, by, model.seed)
             dependent = found is not None and found.dependent
             if exact is not None and by.groups is None:
                 # Folds correct the error of the inducing points. The exact model has none.
@@ -133,6 +134,8 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     if found is not None:
         values = values | {"signal": found.signal, "noise": found.noise}
         messages.append(signal_gone(found.gone, len(found.noise)))
+    if doubts is not None:
+        messages.append(many_outliers(doubts.far))
     if sparse.tight and (found is not None or changed):
         # The charge of the tight bound is that of one signal and noise.
         statistics = sparse.statistics(values, model.blocks)

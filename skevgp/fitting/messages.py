@@ -18,6 +18,8 @@ _NOTHING_LEARNED = 0.99
 _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 # y is far from its prior mean by so many times its standard deviation, a weight by so many prior standard deviations.
 _FAR, _FAR_WEIGHT = 1e4, 100.0
+# Noise with outliers is tested with up to this share of outliers.
+_MOST_OUTLIERS = 0.15
 
 DEPENDENT_ROWS = (
     "Neighbouring rows are similar, and blocks of rows are predicted worse than single rows. std is too small for new "
@@ -77,6 +79,16 @@ def signal_gone(gone: int, n_outputs: int) -> str:
         f"The Gaussian process does not improve predictions of left-out groups for {gone} of {n_outputs} outputs that "
         "are fitted together. std accounts for this. More groups, other columns (kernel_map) or "
         "other features may help."
+    )
+
+
+def many_outliers(share: float) -> str:
+    """Message that more rows are outliers than the noise model can tell from the others."""
+    if share <= _MOST_OUTLIERS:
+        return ""
+    return (
+        f"{share:.0%} of the rows are far from the prediction. With more than {_MOST_OUTLIERS:.0%} of outliers, mean "
+        "and std may be wrong. Remove wrong rows before the fit, or use other features or other columns (kernel_map)."
     )
 
 

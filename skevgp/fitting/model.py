@@ -110,7 +110,7 @@ def models_of(
 ) -> list[Model]:
     """The models of a problem, each with its rows and its start. Arguments are those of `fit_model`."""
     units, placement, parts = problem.units, problem.placement, parts_of(problem)
-    rows = units.rows(problem.source, threads)
+    rows, everything = units.rows(problem.first_source, threads), units.rows(problem.source, threads)
 
     # All models start with the same kernel. If outputs have their own inputs, kernels have own centres and points.
     kernels = centred_kernels(problem.spec.covariance, rows.inputs)
@@ -151,12 +151,12 @@ def models_of(
             and len(sample.targets) >= len(rows)
             and all(are_all_rows(own, sample.of([o]).inputs) for own, o in zip(start, heads, strict=True))
         )
-        own_rows = rows.outputs(part.outputs, 1.0 / min(problem.n_threads, len(parts)))
+        share = 1.0 / min(problem.n_threads, len(parts))
         n_kernels, exact = (
             len(start) if part.separate else None,
             stay and not part.separate and not problem.noise.heavy_tails,
         )
-        table = starting_table(problem, own_rows, start, variance, n_kernels, exact)
+        table = starting_table(problem, rows.outputs(part.outputs), start, variance, n_kernels, exact)
         if stay:
             table = table.changed("inducing_points", fixed=True)
         columns = range(part.outputs[0], part.outputs[-1] + 1)
@@ -175,7 +175,7 @@ def models_of(
                     problem.tight,
                     problem.orthogonal,
                 ),
-                own_rows.noisier(problem.row_variance),
+                everything.outputs(part.outputs, share).noisier(problem.row_variance),
                 table,
                 seed,
                 monitor.seen_as(

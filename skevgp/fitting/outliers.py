@@ -14,6 +14,7 @@ from ..model.parameters import Values
 from ..model.predictor import Predictor
 from ..noise.base import RowScales
 from .model import ENOUGH, LEAST_TOL, Model
+from .robust import errors_of_medians, ordinary_variance
 from .search import Fit, Start, better, search
 
 if TYPE_CHECKING:
@@ -27,12 +28,20 @@ _MEDIAN_SQUARE = 0.4549
 _FEW = 0.3
 # Share of the iterations before scales are estimated again, and then the number of iterations between estimates.
 _BEFORE, _BETWEEN = 2.0 / 3.0, 50
-# Scales and q alternate until no E[τ] changes by more than this, or so many times.
+# Scales and q alternate until no E[τ] changes by more than this share, or so many times.
 _SETTLED, _TURNS = 0.05, 5
+# Smaller E[τ] are all alike.
+_LEAST_SCALE = 1e-200
+# The weight of an outlier in fits of kernel and noise. (It must not be 0.)
+_NOTHING = 1e-9
+# Short fits are repeated until the set of outliers stays, or so many times.
+_LOOKS = 5
 # The fit ends when the gain between two estimates is less than so many times the tolerance of L-BFGS.
 _PATIENCE = 3.0
 # Rows with larger errors than so many standard deviations of the others do not count for the noise of y.
 _FAR = 6.0
+# In the first short fit, which outliers may pull, rows count as outliers from so many standard deviations.
+_FAR_FROM_MEDIAN = 3.0
 # Number of rows that are predicted at once.
 _ROWS_AT_ONCE = 4096
 
@@ -45,13 +54,18 @@ class RowDoubts:
     scales: RowScales
     # (o,): the noise variance of rows that are not outliers, in units of σ².
     noise_factor: np.ndarray
+    # Share of the rows with errors far from the median error.
+    far: float = 0.0
 
     def weigh(self, rows: Rows) -> Rows:
         """The rows weighted by their noise scales."""
-        source = rows.source
-        if not isinstance(source, LocalSource):
-            raise TypeError("Rows of Dask arrays cannot be doubted.")
-        return replace(rows, source=source.reweighted(self.scales.mean, self.scales.log_variance))
+        return replace(rows, source=_local(rows).reweighted(self.scales.mean, self.scales.log_variance))
+
+    def without_outliers(self, rows: Rows) -> Rows:
+        """The same rows, with outliers that have almost no weight, for a fit of kernel and noise."""
+        # A far outlier adds (ν + o) σ² to the sum of E[τ] times squared errors, where another row adds o σ². One in ten
+        # rows would raise σ² by half and more, and with it the distance at which a row is an outlier.
+        return _without(rows, self.scales.outlier > 0.5)
 
     def precision(self, sparse: SparseModel, noise: np.ndarray) -> np.ndarray | None:
         """E[τ]/σ² (o, n) of each output and row, if the bound is the tight one."""
@@ -81,15 +95,17 @@ class RowDoubts:
 
     def differ_from(self, before: RowDoubts) -> bool:
         """Whether the scale of some row has changed."""
-        return bool(np.abs(self.scales.mean - before.scales.mean).max() >= _SETTLED)
+        # A far outlier has E[τ] near σ² / error²: only a relative change shows that σ² is still too large.
+        now, then = (np.maximum(doubts.scales.mean, _LEAST_SCALE) for doubts in (self, before))
+        return bool(np.abs(np.log(now / then)).max() >= _SETTLED)
 
 
 def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, RowDoubts]:
-    """Fit a model with heavy-tailed noise by coordinate ascent. No step lowers the bound."""
+    """Fit a model with heavy-tailed noise: fits of kernel and noise without outliers, and noise scales, alternate."""
     rows, doubts = model.rows, _first_doubts(model)
     first = model.max_iter - int((1.0 - _BEFORE) * model.max_iter)
     # Without outliers, the first fit is that with Gaussian noise.
-    seen = doubts.weigh(rows) if (doubts.scales.outlier > 0.5).any() else rows
+    seen = doubts.without_outliers(doubts.weigh(rows)) if (doubts.scales.outlier > 0.5).any() else rows
     weighed, fit = run(replace(model, rows=seen, max_iter=first))
     weighed = replace(weighed, max_iter=model.max_iter)
     with model.monitor.keeping_the_best():
@@ -99,25 +115,71 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
             if fit.n_iter >= model.max_iter or (fit.converged and not moved):
                 break
             until = min(fit.n_iter + _BETWEEN, model.max_iter)
-            further = better(fit, weighed.minimise(Start(fit.values, until, fit)))
-            enough = _PATIENCE * _tolerance(weighed, further)
-            fit, gained = further, further.bound - fit.bound
-            if gained < enough:
+            others = replace(weighed, rows=doubts.without_outliers(weighed.rows))
+            bound = others.minimise(Start(fit.values, 0)).bound
+            fit = better(replace(fit, bound=bound), others.minimise(Start(fit.values, until, fit)))
+            if fit.bound - bound < _PATIENCE * _tolerance(others, fit):
                 fit = replace(fit, converged=True, message="")
-    return weighed, fit, doubts
+    # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
+    weighed = replace(weighed, rows=doubts.weigh(rows))
+    doubts = replace(doubts, far=look_at(rows, predictor_at(weighed, fit.values)).far_from_median(_FAR).mean())
+    return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
 
 
 def _first_doubts(model: Model) -> RowDoubts:
-    """Noise scales from a short fit to some rows. The median of its errors gives the variance."""
+    """Noise scales from short fits to some rows. The median of their errors gives the variance."""
+    # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
+    # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
-    some = rows.random_subset(size, model.rng) if size < len(rows) else rows
-    short = replace(model, rows=some, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
-    look = look_at(rows, predictor_at(short, search(short).values))
-    n_outputs = look.errors.shape[1]
-    scales = model.problem.noise.row_scales(n_outputs, look.distances(look.typical))
-    if np.mean(scales.outlier > 0.5) > _FEW:
-        scales = scales.at(np.zeros(len(rows)))
-    return RowDoubts(scales, np.ones(n_outputs))
+    doubts, values = _doubts_of_medians(model), None
+    chosen = np.arange(len(rows))
+    if size < len(rows):
+        chosen = np.sort(model.rng.choice(len(rows), size, replace=False))
+    short = replace(model, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
+    seen = doubts.without_outliers(doubts.weigh(rows))
+    for turn in range(_LOOKS):
+        short = replace(short, rows=seen.subset(chosen))
+        fit = search(short) if values is None else short.minimise(Start(values, short.max_iter))
+        look = look_at(rows, predictor_at(short, fit.values))
+        if turn == 0:
+            # The pulled fit shifts the errors of all other rows.
+            far = look.far_from_median(_FAR_FROM_MEDIAN)
+            seen = _without(doubts.weigh(rows), far & (far.mean() <= _FEW))
+        else:
+            before, doubts = doubts, _few(doubts.scales.at(look.distances(look.typical)), look.errors.shape[1])
+            seen = doubts.without_outliers(doubts.weigh(rows))
+            if ((doubts.scales.outlier > 0.5) == (before.scales.outlier > 0.5)).all():
+                break
+        values = fit.values
+    return doubts
+
+
+def _doubts_of_medians(model: Model) -> RowDoubts:
+    """Noise scales from the errors of the medians of neighbours."""
+    raw = model.rows.some(np.arange(len(model.rows)))
+    errors = errors_of_medians(raw.inputs.reshape(len(raw.inputs), -1), raw.targets)
+    if raw.counts is not None and raw.precision is not None:
+        errors *= np.sqrt(raw.precision / raw.counts)[:, np.newaxis]
+    variance = ordinary_variance(errors)
+    distances = (errors**2 / np.where(variance > 0.0, variance, np.inf)).sum(axis=1)
+    return _few(model.problem.noise.row_scales(errors.shape[1], distances), errors.shape[1])
+
+
+def _few(scales: RowScales, n_outputs: int) -> RowDoubts:
+    """These scales, or 1 for all rows if too many seem to be outliers."""
+    outlier = scales.outlier > 0.5
+    return RowDoubts(scales.at(np.zeros(len(outlier))) if outlier.mean() > _FEW else scales, np.ones(n_outputs))
+
+
+def _without(rows: Rows, outlier: np.ndarray) -> Rows:
+    """The same rows, of which some (n,) have almost no weight."""
+    return replace(rows, source=_local(rows).repeated(np.where(outlier, _NOTHING, 1.0)))
+
+
+def _local(rows: Rows) -> LocalSource:
+    if not isinstance(rows.source, LocalSource):
+        raise TypeError("Rows of Dask arrays cannot be doubted.")
+    return rows.source
 
 
 def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model, Fit, RowDoubts]:
@@ -168,6 +230,13 @@ class Look:
     def squares(self) -> np.ndarray:
         """E(y - g)² / v, (n, o)."""
         return (self.errors**2 + self.latent) / self.variance[:, np.newaxis]
+
+    def far_from_median(self, most: float) -> np.ndarray:
+        """Whether an error of a row (n,) is more than ``most`` standard deviations away from the median error."""
+        distance = np.abs(self.errors - np.median(self.errors, axis=0)) / np.sqrt(self.variance)[:, np.newaxis]
+        scale = np.median(distance, axis=0) / np.sqrt(_MEDIAN_SQUARE)
+        far: np.ndarray = (distance > most * scale).any(axis=1)
+        return far
 
     @property
     def typical(self) -> np.ndarray:

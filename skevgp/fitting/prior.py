@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import eigh
+from scipy.linalg import eigh, svd
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 
@@ -17,8 +17,11 @@ from ..utils.sklearn import safe_indexing
 from ..utils.state import StatefulEstimator
 from ..utils.validation import as_floats, check_magnitude
 
-# Without a prior from the map, a feature may explain this many times the target's standard deviation.
-_WIDE = 10.0
+# The scale of a weight without prior knowledge is so many times the largest that least squares could give. The prior
+# then changes predictions by 1e-6 of their std. If the scale is learned, it starts at this share of that.
+_WIDE, _START_OF_LEARNED = 1e3, 1e-2
+# Smallest share of a feature that other features do not represent. A still smaller one than the second is rounding.
+_INDEPENDENT, _COLLINEAR = 1e-6, 1e-12
 # Rounding errors of correlations.
 _ROUNDING = 1e-8
 
@@ -34,9 +37,9 @@ class CoefPrior(StatefulEstimator):
         Prior mean. If ``"auto"``, that of the method ``coef_prior(n_outputs)`` of the feature map, or 0 if the map has
         no such method.
     scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
-        Prior standard deviation. If ``"auto"``, that of the feature map, or 10 * std(y) / rms(h) if the map has no
-        prior. A scale of 0 keeps a weight at its mean. `EGPRegressor` also takes ``np.inf``, which gives generalised
-        least squares.
+        Prior standard deviation. If ``"auto"``, that of the feature map. If the map has no prior, 1000 times the
+        largest weight that least squares could give, so that the prior has no effect on predictions. A scale of 0 keeps
+        a weight at its mean. `EGPRegressor` also takes ``np.inf``, which gives generalised least squares.
     cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
         Prior covariance Σ, of all outputs or of each, instead of ``scale``. For example, the mass and the first moment
         of a link are correlated.
@@ -125,8 +128,10 @@ class Resolved(NamedTuple):
 class InData:
     """What the data say of sizes. k is 1 if outputs share their weights, else their number."""
 
-    # (k, p): the scale of weights without prior knowledge, from `wide_scale`.
-    wide: np.ndarray
+    # k and p.
+    shape: tuple[int, int]
+    # Returns the scale (k, p) of weights without prior knowledge, from `wide_scale`.
+    wide: Callable[[], np.ndarray]
     # (p,) or (o, p): the rms of each feature.
     size: np.ndarray
     # Maps a prior mean (k, p) to the rms (o,) of what it leaves of y.
@@ -151,7 +156,7 @@ def resolved(
     parts. ``allow_vague`` allows infinite scales. Raises a ValueError if a shape does not fit, a value is not finite, a
     scale is negative, a covariance is not positive semi-definite, or weights of two groups are correlated.
     """
-    shape, shared = data.wide.shape, n_outputs > len(data.wide)
+    shape, shared = data.shape, n_outputs > data.shape[0]
     for name in ("mean", "scale", "cov", "groups"):
         value = getattr(prior, name)
         if feature_map is None and (isinstance(value, list | tuple) or np.ndim(value) > 0):
@@ -174,7 +179,7 @@ def resolved(
     if _word(prior.mean) != "auto":
         mean = _as_table(prior.mean, "mean of CoefPrior", shape, shared)
     _check_finite(mean, "mean of CoefPrior")
-    scale_name = 'scale="auto" of CoefPrior, the feature map\'s or 10 std(y) / rms of a feature,'
+    scale_name, unknown = 'scale="auto" of CoefPrior, from the feature map or the data,', np.zeros(shape, dtype=bool)
     if prior.cov is not None:
         scale, correlation = _of_covariance(prior.cov, "cov of CoefPrior", shape)
     elif by_hand:
@@ -182,11 +187,14 @@ def resolved(
         scale, correlation = _as_table(prior.scale, scale_name, shape, shared), _independent(shape)
     else:
         scale = _in_units_of_data(scale, mean, parts, data)
-    _check_finite(np.where(scale == np.inf, data.wide, scale) if allow_vague else scale, scale_name)
+        unknown = np.isnan(scale)
+        scale = np.where(unknown, data.wide(), scale) if unknown.any() else scale
+    _check_finite(np.where(scale == np.inf, 1.0, scale) if allow_vague else scale, scale_name)
     if (scale < 0).any():
         raise ValueError(f"scale of CoefPrior must not be negative; its smallest value is {scale.min()}.")
     groups = _groups(prior, parts, n_outputs, shape, by_hand)
     groups[(scale == 0.0) | np.isinf(scale)] = ""
+    scale = np.where(unknown & (groups != ""), _START_OF_LEARNED * scale, scale)
     mean, scale = mean.astype(float), scale.astype(float)
     if (correlation == _independent(shape)).all():
         return Resolved(mean, scale, None, groups)
@@ -201,7 +209,7 @@ def _check_finite(values: np.ndarray, name: str) -> None:
 
 
 def _in_units_of_data(scale: np.ndarray, mean: np.ndarray, parts: Sequence[_Part], data: InData) -> np.ndarray:
-    """Scales (k, p) in which those that are NaN are taken from the sizes of the data."""
+    """Scales (k, p) in which those that are NaN are taken from the sizes of the data, if a map knows how."""
     scale = scale.copy()
     asking = [part for part in parts if hasattr(part.feature_map, "coef_scale") and np.isnan(scale).any()]
     left_over = data.left_over(mean) if asking else np.empty(0)
@@ -218,7 +226,7 @@ def _in_units_of_data(scale: np.ndarray, mean: np.ndarray, parts: Sequence[_Part
         found = found.reshape(allowed[0]) / abs(part.weight)
         missing = np.isnan(scale[:, part.columns])
         scale[:, part.columns] = np.where(missing, found, scale[:, part.columns])
-    return np.where(np.isnan(scale), data.wide, scale)
+    return scale
 
 
 def _groups(
@@ -335,23 +343,49 @@ def _shapes_text(shape: tuple[int, int], shared: bool) -> str:
     return f"the shape (n_outputs, n_features_out) = {shape}{alone}"
 
 
-def wide_scale(
-    feature_size: np.ndarray, target_std: np.ndarray, target_largest: np.ndarray, shared: bool = False
-) -> np.ndarray:
-    """10 * std(y) / rms(h), the scale of weights without prior knowledge: (o, p), or (1, p) if they are shared.
+def wide_scale(triangles: np.ndarray, n_rows: float, target_size: np.ndarray, shared: bool = False) -> np.ndarray:
+    """The scale of weights without prior knowledge: (o, p), or (1, p) if they are shared.
 
-    ``feature_size`` (p,) or (o, p) is the rms of each feature. ``target_largest`` (o,) is the largest absolute value of
-    each target, which is used if its standard deviation is 0. For shared weights the widest scale of all outputs
-    counts.
+    ``triangles`` (k, r, p) are R with HᵀΩH = RᵀR, one for all outputs or o. ``n_rows`` is Σω, and ``target_size`` (o,)
+    the largest absolute value of each target. For shared weights the widest scale of all outputs counts.
     """
-    size = np.where(target_std > 0.0, target_std, target_largest)
-    size = _WIDE * np.where(size > 0.0, size, 1.0)[:, np.newaxis]
-    if not shared:
-        return size / np.where(feature_size > 0.0, feature_size, 1.0)
-    feature_size = np.broadcast_to(feature_size, (len(size), np.shape(feature_size)[-1]))
-    known = feature_size > 0.0
-    wide = np.where(known, size / np.where(known, feature_size, 1.0), 0.0).max(axis=0, keepdims=True)
-    return np.where(wide > 0.0, wide, size.max())
+    # With |y| ≤ a on all rows, least squares gives no weight above a √(Σω (HᵀΩH)⁻¹_jj) (by Cauchy-Schwarz). That is
+    # a / rms of the part of h_j that the other features cannot represent. For powers of a column far from 0, it is far
+    # above a / rms(h_j).
+    o, p = len(target_size), triangles.shape[-1]
+    size = np.where(target_size > 0.0, target_size, 1.0)
+    of_zeros = size.max() if shared else size[:, np.newaxis]
+    each = np.broadcast_to(triangles, (o, *triangles.shape[1:]))
+    alone = size[:, np.newaxis] / np.where((rms := _sizes(each) / np.sqrt(n_rows)) > 0.0, rms, np.inf)
+    if shared:
+        alone = alone.max(axis=0, keepdims=True)
+        # The rows of all outputs, in units of their targets.
+        each = np.linalg.qr((each / size[:, np.newaxis, np.newaxis]).reshape(-1, p)).R[np.newaxis]
+        n_rows, size = n_rows * o, np.ones(1)
+    largest = np.array([np.sqrt(n_rows) * unit * _dual_sizes(R) for unit, R in zip(size, each, strict=True)])
+    largest = np.maximum(largest, alone)
+    return _WIDE * np.where(largest > 0.0, largest, of_zeros)
+
+
+def _sizes(triangles: np.ndarray) -> np.ndarray:
+    """√ of the diagonal of RᵀR (..., p)."""
+    largest = np.abs(triangles).max(axis=-2, initial=0.0)
+    unit = np.where(largest > 0.0, largest, 1.0)
+    found: np.ndarray = unit * np.sqrt(np.sum((triangles / unit[..., np.newaxis, :]) ** 2, axis=-2))
+    return np.where(largest > 0.0, found, 0.0)
+
+
+def _dual_sizes(R: np.ndarray) -> np.ndarray:
+    """√ of the diagonal (p,) of (RᵀR)⁺, without digits that rounding may have changed. 0 for a column of zeros."""
+    sizes = _sizes(R)
+    seen = sizes > 0.0
+    found = np.zeros(len(sizes))
+    if seen.any():
+        _, values, vectors = svd(R[:, seen] / sizes[seen], full_matrices=False, lapack_driver="gesvd")
+        kept = values > _COLLINEAR * values[0]
+        by = np.maximum(values[kept], _INDEPENDENT * values[0])
+        found[seen] = np.sqrt(np.sum((vectors[kept] / by[:, np.newaxis]) ** 2, axis=0)) / sizes[seen]
+    return found
 
 
 class _Part(NamedTuple):

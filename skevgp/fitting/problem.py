@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 
 from ..data.dataset import Dataset
 from ..data.maps import RowShapes
-from ..data.rows import Moments, Source, moments_of_rows
+from ..data.rows import LocalSource, Moments, Source, moments_of_rows
 from ..kernels.parse import KernelSpec, parse_kernel
 from ..model.bounds import PosteriorFamily
 from ..model.predictor import CoefficientPrior
@@ -22,11 +23,12 @@ from ..utils.validation import check_magnitude, check_not_vanishing
 from .calibration import CrossValidation
 from .inducing import Placement
 from .prior import CoefPrior, InData, resolved, says_shared, wide_scale
+from .robust import without_far_targets
 from .search import Rules, rules_of
-from .units import LeftOver, Units
+from .units import LeftOver, Units, triangles_of_features
 
-# An infinite prior scale becomes this many times the scale with which a feature could explain y alone.
-_VAGUE = 1e3
+# An infinite prior scale becomes this many times the scale of weights without prior knowledge.
+_VAGUE = 10.0
 # A feature that is smaller than this share of the largest one counts as 0.
 _NEGLIGIBLE = 1e-80
 # Largest prior standard deviation of the features' contribution, in units of the residuals. Its square over the lowest
@@ -50,6 +52,8 @@ class Problem:
     vague: np.ndarray
     # Shapes of a row's kernel inputs and of its features.
     shapes: RowShapes
+    # The same rows with far outliers of y moved to the others, for the starts. None: those of ``source``.
+    ordinary: Source | None = None
     # (n,): the group of each row of the source.
     groups: np.ndarray | None = None
     # How inducing points are placed. The exact model does not use it.
@@ -88,8 +92,13 @@ class Problem:
     ) -> Problem:
         """Find the kernel's start, the prior of the weights and the internal units from the rows.
 
+        If the noise has heavy tails, they are found without the far outliers of y.
+
         ``allow_vague`` allows infinite prior scales.
         """
+        source = data.source
+        if noise.heavy_tails and isinstance(data.source, LocalSource):
+            data = replace(data, source=without_far_targets(data.source))
         inputs, features, targets = data.source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
         check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
@@ -124,7 +133,8 @@ class Problem:
             _LARGEST_SPREAD,
         )
         shapes = inputs.mean.shape, features.mean.shape
-        return cls(data.source, units, spec, vague, shapes, data.groups, noise=noise)
+        ordinary = None if data.source is source else data.source
+        return cls(source, units, spec, vague, shapes, ordinary, data.groups, noise=noise)
 
     def with_features(self, data: Dataset, prior: CoefficientPrior) -> Problem:
         """The same problem with other features of the same rows. ``prior`` is that of their weights."""
@@ -133,7 +143,12 @@ class Problem:
         vague = np.zeros(prior.scale.shape, dtype=bool)
         vague[:, : self.vague.shape[1]] = self.vague
         shapes = inputs.mean.shape, features.mean.shape
-        return replace(self, source=data.source, units=units, vague=vague, shapes=shapes)
+        return replace(self, source=data.source, ordinary=None, units=units, vague=vague, shapes=shapes)
+
+    @property
+    def first_source(self) -> Source:
+        """The rows for the starts: without far outliers of y if the noise has heavy tails."""
+        return self.source if self.ordinary is None else self.ordinary
 
     @property
     def n_outputs(self) -> int:
@@ -188,22 +203,29 @@ def _prior(
         raise ValueError("shared=True of CoefPrior needs a feature_map, because its features have the weights.")
     shared = bool(shared) and o > 1 and feature_map is not None
     # A bump far from all rows, for example, counts as 0.
-    size = np.where(features.largest > _NEGLIGIBLE * features.largest.max(initial=0.0), features.rms, 0.0)
+    counts = features.largest > _NEGLIGIBLE * features.largest.max(initial=0.0)
+    size = np.where(counts, features.rms, 0.0)
 
     def left_over(mean: np.ndarray) -> np.ndarray:
         _, squares = data.source.sum(LeftOver(target_mean, np.broadcast_to(mean, (o, mean.shape[1]))))
         found = np.sqrt(squares / targets.n)
         return np.where(found > 0.0, found, np.where(targets.largest > 0.0, targets.largest, 1.0))
 
-    wide = wide_scale(size, np.sqrt(targets.variance), targets.largest, shared)
-    found = resolved(asked, feature_map, data.given, InData(wide, size, left_over), o, allow_vague)
+    @cache
+    def wide() -> np.ndarray:
+        R, total_precision = triangles_of_features(data.source)
+        largest = np.maximum(np.abs(targets.lowest - target_mean), np.abs(targets.highest - target_mean))
+        return wide_scale(R * counts.reshape(-1, 1, counts.shape[-1]), total_precision, largest, shared)
+
+    shape = 1 if shared else o, features.mean.shape[-1]
+    found = resolved(asked, feature_map, data.given, InData(shape, wide, size, left_over), o, allow_vague)
     mean, scale, root, groups = found.mean, found.scale, found.root, found.groups
     if shared:
         mean, scale, groups = (np.repeat(values, o, axis=0) for values in (mean, scale, groups))
         root = None if root is None else np.repeat(root, o, axis=0)
     vague = np.isinf(scale)
     # An infinite scale becomes one so wide that its value does not matter.
-    scale = np.where(vague, _VAGUE * wide_scale(size, targets.largest, targets.largest, shared), scale)
+    scale = np.where(vague, _VAGUE * wide(), scale) if vague.any() else scale
     labels = tuple(dict.fromkeys(label for label in groups.ravel() if label))
     numbers = None
     if labels:

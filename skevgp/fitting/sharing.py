@@ -91,7 +91,7 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
 
     # Rows outside of the sample may say more. Other outputs must not dominate its kernel then: it has its own group.
     unknown = [o for o in everything if o not in learned]
-    variance = problem.units.rows(problem.source).residuals.variance if unknown else np.empty(0)
+    variance = problem.units.rows(problem.first_source).residuals.variance if unknown else np.empty(0)
     still = [o for o in unknown if problem.units.constant is not None and problem.units.constant[o]]
     hidden = [o for o in unknown if variance[o] > _CONSTANT and o not in still]
     constant = [o for o in unknown if o not in (*hidden, *still)]
@@ -138,13 +138,15 @@ class _ShortFits:
     @classmethod
     def of(cls, problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> _ShortFits:
         """Make the first fit."""
-        raw = Rows(problem.source, lambda rows: rows).sample(_SAMPLE, rng)
+        raw = Rows(problem.first_source, lambda rows: rows).sample(_SAMPLE, rng)
         source = LocalSource.holding(raw)
         most = problem.placement.max_inducing or problem.placement.n_inducing
         placement = Placement("k-means", min(most, _POINTS))
         # Here outputs do not share their weights: only the kernel matters.
         units = replace(problem.units, prior=replace(problem.units.prior, shared=False))
-        problem = replace(problem, source=source, units=units, placement=placement, sharing="all", family="full")
+        problem = replace(
+            problem, source=source, ordinary=None, units=units, placement=placement, sharing="all", family="full"
+        )
         (model,) = models_of(problem, rng, monitor, BlockMap())
         together = _short_fit(model, model.table, _FIRST_ITERATIONS, monitor)
         points = together[0]["inducing_points"][0]

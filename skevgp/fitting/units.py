@@ -63,6 +63,17 @@ class _ProductsIn:
         return (_products(raw, self.basis),)
 
 
+def _feature_products(raw: RawRows) -> tuple[np.ndarray, float]:
+    """HᵀΩH and Σω."""
+    return _products(raw), raw.total if raw.precision is None else float(raw.precision.sum())
+
+
+def triangles_of_features(source: Source) -> tuple[np.ndarray, float]:
+    """Upper triangular R (k, p, p) with RᵀR = HᵀΩH (see `_triangles`), and Σω."""
+    HH, total_precision = source.sum(_feature_products)
+    return _triangles(source, HH), total_precision
+
+
 def _triangles(source: Source, HH: np.ndarray) -> np.ndarray:
     """Upper triangular R (k, p, p) with RᵀR = HᵀΩH. k is the number of outputs if each has its own features, else 1."""
     # Features may be nearly collinear, as powers of a column far from 0. Then the products are summed again in the
