@@ -367,7 +367,7 @@ def fit_exact(
     # Messages for the user.
     learned = model.prior.at(best.values)
     proper = replace(learned, reference=np.where(vague, 0.0, learned.reference))
-    messages = [best.message, far_from_prior(proper, rows)]
+    messages = [best.message, far_from_prior(proper, rows, problem.weight_names)]
     if problem.max_iter > 0:
         each = [(rows, best.values["noise"])]
         if others:

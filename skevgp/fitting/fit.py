@@ -115,7 +115,8 @@ def grown(model: Model) -> tuple[Model, Fit]:
 def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedModel:
     """Calibrate signal and noise, compute the bounds and make the predictor of a fit."""
     sparse, values, exact, by = model.sparse, fit.values, model.exact, model.problem.noise_cv
-    messages, found, dependent = [fit.message, far_from_prior(sparse.prior.at(values), model.rows)], None, False
+    messages = [fit.message, far_from_prior(sparse.prior.at(values), model.rows, model.problem.weight_names)]
+    found, dependent = None, False
     values, changed = with_signal_of_constants(model.problem, model.rows, model.table, values)
     statistics = sparse.statistics(values, model.blocks)
     if not model.monitor.stopped and model.max_iter > 0:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..data.rows import Rows
@@ -18,6 +20,10 @@ _NOTHING_LEARNED = 0.99
 _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 # y is far from its prior mean by so many times its standard deviation, a weight by so many prior standard deviations.
 _FAR, _FAR_WEIGHT = 1e4, 100.0
+# The standard deviation of a sample, as a share of its range, is about this or more.
+_STD_OF_RANGE = 0.15
+# Largest number of names in a message.
+_NAMES = 5
 # Noise with outliers is tested with up to this share of outliers.
 _MOST_OUTLIERS = 0.15
 
@@ -92,21 +98,28 @@ def many_outliers(share: float) -> str:
     )
 
 
-def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
-    """Message that y, or a weight, is too far from its prior mean."""
-    # Residuals that are rounding errors of y are not of size one.
-    far = rows.residuals.mean[rows.columns] ** 2
-    if (rows.scatter() / rows.mean_precision < _FAR**-2 * np.minimum(far, 1.0)).any():
+def far_from_prior(prior: CoefficientPrior, rows: Rows, names: Sequence[str]) -> str:
+    """Message that y, or a weight, is too far from its prior mean. ``names`` are those of the first weights."""
+    # Residuals that are rounding errors of y are not of size one. The range shows their size even if a few rows have
+    # almost all of the precision.
+    y = rows.residuals
+    size = np.maximum(np.sqrt(y.variance), _STD_OF_RANGE * (y.highest - y.lowest))
+    if (size < np.minimum(np.abs(y.mean), 1.0) / _FAR)[rows.columns].any():
         return (
             f"y is more than {_FAR:g} times its scatter away from its prior mean of 0, which leaves the kernel little "
             "accuracy for the rest. Set normalize_y=True, or add an intercept to the feature_map."
         )
-    # Weights with a learned scale are as far as their scale allows.
-    fixed = True if prior.groups is None else prior.groups < 0
-    if ((np.abs(prior.reference) > _FAR_WEIGHT) & fixed).any():
+    # Weights with a learned scale are as far as their scale allows, and those with the scale 0 stay. The weights after
+    # the named ones are those of parameters θ.
+    p = len(names)
+    fixed = (prior.scale > 0.0) & (True if prior.groups is None else prior.groups < 0)
+    far = ((np.abs(prior.reference) > _FAR_WEIGHT) & fixed)[:, :p].any(axis=0)
+    if far.any():
+        told = [str(name) for name, is_far in zip(names, far, strict=True) if is_far]
+        shown = ", ".join(told[:_NAMES]) + (f" and {len(told) - _NAMES} more" if len(told) > _NAMES else "")
         return (
-            f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean. "
-            "Raise the scale of coef_prior. For an intercept, set normalize_y=True."
+            f"The weights of {shown} are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior "
+            "mean. Check the units of X and y, or raise the scale of coef_prior for these weights."
         )
     return ""
 

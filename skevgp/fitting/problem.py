@@ -22,7 +22,7 @@ from ..solvers.base import Solver
 from ..utils.validation import check_magnitude, check_not_vanishing
 from .calibration import CrossValidation
 from .inducing import Placement
-from .prior import CoefPrior, InData, resolved, says_shared, wide_scale
+from .prior import CoefPrior, InData, coef_names, resolved, says_shared, wide_scale
 from .robust import without_far_targets
 from .search import Rules, rules_of
 from .units import LeftOver, Units, triangles_of_features
@@ -52,6 +52,8 @@ class Problem:
     vague: np.ndarray
     # Shapes of a row's kernel inputs and of its features.
     shapes: RowShapes
+    # Names of the weights, without those of the slopes in parameters θ.
+    weight_names: tuple[str, ...] = ()
     # The same rows with far outliers of y moved to the others, for the starts. None: those of ``source``.
     ordinary: Source | None = None
     # (n,): the group of each row of the source.
@@ -134,7 +136,8 @@ class Problem:
         )
         shapes = inputs.mean.shape, features.mean.shape
         ordinary = None if data.source is source else data.source
-        return cls(source, units, spec, vague, shapes, ordinary, data.groups, noise=noise)
+        names = tuple(coef_names(data.maps.feature_map, data.maps.columns, features.mean.shape[-1]))
+        return cls(source, units, spec, vague, shapes, names, ordinary, data.groups, noise=noise)
 
     def with_features(self, data: Dataset, prior: CoefficientPrior) -> Problem:
         """The same problem with other features of the same rows. ``prior`` is that of their weights."""

@@ -63,6 +63,8 @@ _DIFFERENCE, _FLAT = 0.1, 0.1
 _UNIDENTIFIED = 0.95
 # They ask for a value outside of its prior if it is also further than so many standard deviations from the median.
 _EDGE = 2.0
+# A parameter that is further than this from the median disagrees with its prior, however well the data identify it.
+_FAR = 3.0
 
 
 class FitOfTheta(Protocol):
@@ -106,8 +108,9 @@ class Calibration:
         """Warn if the data do not identify a parameter, or ask for values outside of its prior."""
         if names := self.posterior.at_edges():
             warn_user(
-                f"The parameters {names} ended at the edges of their priors, where their standard deviations are not "
-                "valid. Give them wider priors if the data may be right.",
+                f"The parameters {names} ended at the edges of their priors, far from the medians. "
+                "Their standard deviations may not be valid. Check the model "
+                "and its units, or give the parameters wider priors.",
                 ConvergenceWarning,
             )
         if names := self.posterior.unidentified():
@@ -168,8 +171,10 @@ class ThetaPosterior:
         return self._named(self._wide & (np.abs(self.mean) <= _EDGE))
 
     def at_edges(self) -> list[str]:
-        """Names of the parameters at a bound of their prior: there, a value hardly depends on its coordinate."""
-        return self._named(self._wide & (np.abs(self.mean) > _EDGE))
+        """Names of the parameters at an edge of their prior, or far outside of it."""
+        # At a bound, a value hardly depends on its coordinate, so that the posterior may be wide.
+        distance = np.abs(self.mean)
+        return self._named((distance > _FAR) | (self._wide & (distance > _EDGE)))
 
     @property
     def _wide(self) -> np.ndarray:
