@@ -1,10 +1,15 @@
 """``noise="student-t"``: rows that are wrong, and who notices."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EVGPRegressor
+from skevgp.noise import StudentT
 from skevgp.solvers import LBFGS, Adam
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -103,3 +108,80 @@ def test_dask_arrays_raise():
     da = pytest.importorskip("dask.array")
     with pytest.raises(ValueError, match="rows in memory or in a file.*Array"):
         evgp().fit(da.from_array(X), da.from_array(Y))
+
+
+# --- far outliers, on one side or both, of any noise model ------------------------------------------------------------
+
+FIELD_X = np.random.default_rng(1).uniform(-3.0, 3.0, (300, 2))
+FIELD = np.sin(FIELD_X[:, 0]) + 0.3 * FIELD_X[:, 1]
+FIELD_Y = FIELD + 0.1 * np.random.default_rng(2).standard_normal(300)
+
+
+def with_outliers(share, sigmas, sides=1):
+    """Rows, and which of them are wrong by so many standard deviations of the noise."""
+    rng = np.random.default_rng(3)
+    bad = np.zeros(300, dtype=bool)
+    bad[rng.permutation(300)[: max(int(share * 300), 1)]] = True
+    signs = np.where(rng.random(300) < 0.5, -1.0, 1.0) if sides == 2 else 1.0
+    return FIELD_Y + 0.1 * sigmas * bad * signs, bad
+
+
+@pytest.mark.parametrize(
+    ("share", "sigmas", "sides"),
+    [(0.0, 1e2, 1), (0.0, 1e9, 1), (0.15, 10.0, 1), (0.15, 20.0, 1), (0.15, 1e4, 2), (0.15, 1e9, 1)],
+)
+def test_noise_and_intervals_are_those_of_clean_rows(share, sigmas, sides):
+    y, bad = with_outliers(share, sigmas, sides)
+    clean = EVGPRegressor(n_inducing=20, random_state=0).fit(FIELD_X[~bad], FIELD_Y[~bad])
+    model = clone(clean).set_params(noise="student-t").fit(FIELD_X, y)
+    assert model.noise_variance_**0.5 == pytest.approx(clean.noise_variance_**0.5, rel=0.1)
+    assert (model.weights_[bad] < 0.1).all()
+    new = np.random.default_rng(4).uniform(-3.0, 3.0, (2000, 2))
+    truth = np.sin(new[:, 0]) + 0.3 * new[:, 1] + 0.1 * np.random.default_rng(5).standard_normal(2000)
+    mean, std = model.predict(new, return_std=True)
+    assert 0.92 <= np.mean(np.abs(truth - mean) <= 1.96 * std) <= 0.98
+
+
+@pytest.mark.filterwarnings("default")
+def test_more_outliers_than_the_noise_allows_warn():
+    y, _ = with_outliers(0.2, 50.0)
+    with pytest.warns(ConvergenceWarning, match="20% of the rows are far from the prediction"):
+        EVGPRegressor(n_inducing=20, noise="student-t", random_state=0).fit(FIELD_X, y)
+
+
+@dataclass(frozen=True)
+class LaplaceScales:
+    """Each row has Laplace noise with the variance σ² v: 1/τ is exponential."""
+
+    n_outputs: int
+    distances: np.ndarray
+
+    def at(self, distances):
+        return LaplaceScales(self.n_outputs, distances)
+
+    @property
+    def mean(self):
+        return np.sqrt(2.0 / np.maximum(self.distances, 1e-3))
+
+    @property
+    def outlier(self):
+        return np.zeros(len(self.distances))
+
+    @property
+    def log_variance(self):
+        evidence = -0.5 * np.log(2.0) - np.sqrt(2.0 * self.distances) + 0.5 * np.log(2.0 * np.pi)
+        return -2.0 * (evidence + 0.5 * self.mean * self.distances)
+
+
+class Laplace(StudentT):
+    def row_scales(self, n_outputs, distances):
+        return LaplaceScales(n_outputs, distances)
+
+
+def test_far_outliers_do_not_move_a_noise_model_without_outliers():
+    y, bad = with_outliers(0.1, 1e6)
+    model = EVGPRegressor(n_inducing=20, noise=Laplace(), random_state=0)
+    noise = clone(model).fit(FIELD_X[~bad], FIELD_Y[~bad]).noise_variance_
+    model.fit(FIELD_X, y)
+    assert model.noise_variance_ == pytest.approx(noise, rel=0.2)
+    assert np.corrcoef(model.predict(FIELD_X), FIELD)[0, 1] > 0.995

@@ -41,7 +41,7 @@ class EGPRegressor(GaussianProcess):
     .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
               f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
 
-    without approximation. Time is cubic and memory quadratic in the number of rows. Use it for up to a few thousand
+    without approximation. Time is cubic and memory quadratic in the number of rows. Use it for up to about 2,000
     rows.
 
     Parameters

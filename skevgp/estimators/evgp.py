@@ -149,7 +149,7 @@ class EVGPRegressor(GaussianProcess):
 
     See Also
     --------
-    EGPRegressor : The same model without inducing points, for up to a few thousand rows.
+    EGPRegressor : The same model without inducing points, for up to about 2,000 rows.
     sklearn.gaussian_process.GaussianProcessRegressor : The exact Gaussian process without features.
 
     References

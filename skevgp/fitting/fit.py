@@ -126,8 +126,11 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
             lowest = model.rules.lowest_noise * model.scatter
             noisy = values if exact is None else values | {"noise": np.maximum(values["noise"], lowest)}
             with model.monitor.keeping_the_best():
-                rows = model.rows if doubts is None else doubts.without_outliers(model.rows)
-                found = calibrated(sparse, noisy, statistics, model.table, rows, by, model.seed)
+                rows, sums = model.rows, statistics
+                if doubts is not None and doubts.rejected is not None:
+                    rows = doubts.without_outliers(rows)
+                    sums = sparse.statistics(values, sparse.blocks(rows, model.n_inducing))
+                found = calibrated(sparse, noisy, sums, model.table, rows, by, model.seed)
             dependent = found is not None and found.dependent
             if exact is not None and by.groups is None:
                 # Folds correct the error of the inducing points. The exact model has none.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,18 +54,31 @@ class RowDoubts:
     scales: RowScales
     # (o,): the noise variance of rows that are not outliers, in units of σ².
     noise_factor: np.ndarray
+    # (n,): rows with errors that are too large for the noise, whatever its model. None: no row.
+    rejected: np.ndarray | None = None
     # Share of the rows with errors far from the median error.
     far: float = 0.0
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies and pickles of a model hold no rows.
+        return {**vars(self), "rejected": None}
+
+    def seen_in(self, look: Look, noise: np.ndarray, free: np.ndarray) -> RowDoubts:
+        """The doubts for other errors, with noise variances (o,), of which some may be ``free`` (o,)."""
+        scales = self.scales.at(look.distances(noise))
+        rejected = (scales.outlier > 0.5) | look.beyond(noise * self.noise_factor)
+        factor = np.where(free, look.clean_variance(rejected) / noise, 1.0)
+        return RowDoubts(scales, factor, rejected if 0.0 < rejected.mean() <= _FEW else None)
 
     def weigh(self, rows: Rows) -> Rows:
         """The rows weighted by their noise scales."""
         return replace(rows, source=_local(rows).reweighted(self.scales.mean, self.scales.log_variance))
 
     def without_outliers(self, rows: Rows) -> Rows:
-        """The same rows, with outliers that have almost no weight, for a fit of kernel and noise."""
+        """The same rows, with rejected ones that have almost no weight, for a fit of kernel and noise."""
         # A far outlier adds (ν + o) σ² to the sum of E[τ] times squared errors, where another row adds o σ². One in ten
         # rows would raise σ² by half and more, and with it the distance at which a row is an outlier.
-        return _without(rows, self.scales.outlier > 0.5)
+        return rows if self.rejected is None else _without(rows, self.rejected)
 
     def precision(self, sparse: SparseModel, noise: np.ndarray) -> np.ndarray | None:
         """E[τ]/σ² (o, n) of each output and row, if the bound is the tight one."""
@@ -93,6 +106,12 @@ class RowDoubts:
                 break
         return doubts.told(replace(plain.updated(doubts.weigh(rows)), doubts=doubts))
 
+    def rejects_as(self, other: RowDoubts) -> bool:
+        """Whether both reject the same rows."""
+        if self.rejected is None or other.rejected is None:
+            return self.rejected is other.rejected
+        return bool((self.rejected == other.rejected).all())
+
     def differ_from(self, before: RowDoubts) -> bool:
         """Whether the scale of some row has changed."""
         # A far outlier has E[τ] near σ² / error²: only a relative change shows that σ² is still too large.
@@ -105,7 +124,7 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
     rows, doubts = model.rows, _first_doubts(model)
     first = model.max_iter - int((1.0 - _BEFORE) * model.max_iter)
     # Without outliers, the first fit is that with Gaussian noise.
-    seen = doubts.without_outliers(doubts.weigh(rows)) if (doubts.scales.outlier > 0.5).any() else rows
+    seen = rows if doubts.rejected is None else doubts.without_outliers(doubts.weigh(rows))
     weighed, fit = run(replace(model, rows=seen, max_iter=first))
     weighed = replace(weighed, max_iter=model.max_iter)
     with model.monitor.keeping_the_best():
@@ -146,9 +165,9 @@ def _first_doubts(model: Model) -> RowDoubts:
             far = look.far_from_median(_FAR_FROM_MEDIAN)
             seen = _without(doubts.weigh(rows), far & (far.mean() <= _FEW))
         else:
-            before, doubts = doubts, _few(doubts.scales.at(look.distances(look.typical)), look.errors.shape[1])
+            before, doubts = doubts, _first_of(look, doubts.scales)
             seen = doubts.without_outliers(doubts.weigh(rows))
-            if ((doubts.scales.outlier > 0.5) == (before.scales.outlier > 0.5)).all():
+            if doubts.rejects_as(before):
                 break
         values = fit.values
     return doubts
@@ -157,18 +176,25 @@ def _first_doubts(model: Model) -> RowDoubts:
 def _doubts_of_medians(model: Model) -> RowDoubts:
     """Noise scales from the errors of the medians of neighbours."""
     raw = model.rows.some(np.arange(len(model.rows)))
-    errors = errors_of_medians(raw.inputs.reshape(len(raw.inputs), -1), raw.targets)
+    n, o = raw.targets.shape
+    errors = errors_of_medians(raw.inputs.reshape(n, -1), raw.targets)
+    counts = variance = np.ones(n)
     if raw.counts is not None and raw.precision is not None:
-        errors *= np.sqrt(raw.precision / raw.counts)[:, np.newaxis]
-    variance = ordinary_variance(errors)
-    distances = (errors**2 / np.where(variance > 0.0, variance, np.inf)).sum(axis=1)
-    return _few(model.problem.noise.row_scales(errors.shape[1], distances), errors.shape[1])
+        counts, variance = raw.counts, raw.counts / raw.precision
+    look = Look(errors, np.zeros_like(errors), variance, counts)
+    typical = ordinary_variance(np.sqrt(look.squares))
+    # Targets of which most are equal have no scale.
+    typical = np.where(typical > 0.0, typical, np.inf)
+    return _first_of(look, model.problem.noise.row_scales(o, np.zeros(n)), typical)
 
 
-def _few(scales: RowScales, n_outputs: int) -> RowDoubts:
-    """These scales, or 1 for all rows if too many seem to be outliers."""
-    outlier = scales.outlier > 0.5
-    return RowDoubts(scales.at(np.zeros(len(outlier))) if outlier.mean() > _FEW else scales, np.ones(n_outputs))
+def _first_of(look: Look, scales: RowScales, typical: np.ndarray | None = None) -> RowDoubts:
+    """Noise scales from errors with a typical variance (o,), or 1 for all rows if too many seem to be outliers."""
+    typical = look.typical if typical is None else typical
+    doubts = RowDoubts(scales, np.ones(len(typical))).seen_in(look, typical, np.zeros(len(typical), dtype=bool))
+    if np.mean((doubts.scales.outlier > 0.5) | look.beyond(typical)) <= _FEW:
+        return doubts
+    return RowDoubts(scales.at(np.zeros(len(look.errors))), np.ones(len(typical)))
 
 
 def _without(rows: Rows, outlier: np.ndarray) -> Rows:
@@ -191,8 +217,7 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
     noise = fit.values["noise"]
     for _ in range(_TURNS):
         look = look_at(rows, predictor_at(model, fit.values), doubts.precision(model.sparse, noise))
-        factor = np.where(model.table["noise"].free, look.clean_variance() / noise, 1.0)
-        before, doubts = doubts, RowDoubts(doubts.scales.at(look.distances(noise)), factor)
+        before, doubts = doubts, doubts.seen_in(look, noise, model.table["noise"].free)
         model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break
@@ -235,8 +260,11 @@ class Look:
         """Whether an error of a row (n,) is more than ``most`` standard deviations away from the median error."""
         distance = np.abs(self.errors - np.median(self.errors, axis=0)) / np.sqrt(self.variance)[:, np.newaxis]
         scale = np.median(distance, axis=0) / np.sqrt(_MEDIAN_SQUARE)
-        far: np.ndarray = (distance > most * scale).any(axis=1)
-        return far
+        return np.asarray(np.any(distance > most * scale, axis=1))
+
+    def beyond(self, variance: np.ndarray) -> np.ndarray:
+        """Whether an error of a row (n,) is too large for noise variances (o,)."""
+        return np.asarray(np.any(self.squares > _FAR**2 * variance, axis=1))
 
     @property
     def typical(self) -> np.ndarray:
@@ -247,15 +275,13 @@ class Look:
         """The squared Mahalanobis distance (n,) of rows, for noise variances (o,)."""
         return (self.squares / noise).sum(axis=1)
 
-    def clean_variance(self) -> np.ndarray:
-        """Mean squared errors (o,) of the rows that are not outliers."""
-        variance, kept, squares = self.typical, np.zeros(len(self.errors), dtype=bool), self.squares
-        while True:
-            now = (squares <= _FAR**2 * variance).all(axis=1) | kept
-            if (now == kept).all():
-                return variance
-            kept = now
-            variance = np.maximum(self.counts[kept] @ squares[kept] / self.counts[kept].sum(), np.finfo(float).tiny)
+    def clean_variance(self, rejected: np.ndarray) -> np.ndarray:
+        """Mean squared errors (o,) of the rows that are not rejected."""
+        kept = ~rejected
+        if not kept.any():
+            return self.typical
+        squares = self.counts[kept] @ self.squares[kept] / self.counts[kept].sum()
+        return np.maximum(squares, np.finfo(float).tiny)
 
 
 def look_at(rows: Rows, predictor: Predictor, precision: np.ndarray | None = None) -> Look:

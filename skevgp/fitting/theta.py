@@ -108,9 +108,8 @@ class Calibration:
         """Warn if the data do not identify a parameter, or ask for values outside of its prior."""
         if names := self.posterior.at_edges():
             warn_user(
-                f"The parameters {names} ended at the edges of their priors, far from the medians. "
-                "Their standard deviations may not be valid. Check the model "
-                "and its units, or give the parameters wider priors.",
+                f"The parameters {names} ended at the edges of their priors, far from the medians. Their standard "
+                "deviations may not be valid. Check the model and its units, or give the parameters wider priors.",
                 ConvergenceWarning,
             )
         if names := self.posterior.unidentified():

@@ -50,6 +50,7 @@ def problem_of(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):
         "spec": parse_kernel(kernel, X.shape[1]),
         "vague": np.zeros(units.prior.scale.shape, dtype=bool),
         "shapes": (X.shape[1:], H.shape[1:]),
+        "weight_names": tuple(f"h{j}" for j in range(H.shape[1])),
         "placement": Placement("k-means", n_inducing),
         "max_iter": 20,
         "tol": 1.0,
