@@ -6,6 +6,8 @@ a reversal and noise stay: a value must also be impossible. There are three reas
 * It is a velocity that the position contradicts, while the line between its neighbours agrees with the position.
 * It is farther from its neighbours than all other values from each other.
 * It is exactly 0, as a value that a driver does not fill, and farther from its neighbours than steps elsewhere.
+
+An effort or an acceleration stays if the velocity leaps at the same time: it may be an impact.
 """
 
 from __future__ import annotations
@@ -42,15 +44,24 @@ def find_corrupt(raw: Signals, step: float, gap: float, breaks: Sequence[Break])
     """Find corrupt values in the pieces of a sorted recording."""
     steps, whole = np.diff(raw.time), whole_steps(raw.time, gap, breaks)
     found = []
-    for signal, longest in _LONGEST.items():
-        values = getattr(raw, signal)
-        for joint, column in enumerate([] if values is None else values.T):
-            spikes = _Spikes.of(raw.time, column, Steps(steps, whole, column, step), longest)
-            position = raw.position[:, joint] if signal == "velocity" else None
-            found += [
-                Corrupt(Break(*spikes.rows[k], "corrupt"), signal, joint, spikes.worst[k])
-                for k in spikes.impossible(position).tolist()
-            ]
+    for joint, position in enumerate(raw.position.T):
+        leaps = np.zeros(len(steps), dtype=bool)
+        for signal, longest in _LONGEST.items():
+            values = getattr(raw, signal)
+            if values is None:
+                continue
+            of_joint = Steps(steps, whole, values[:, joint], step)
+            spikes = _Spikes.of(raw.time, values[:, joint], of_joint, longest)
+            impossible = spikes.impossible(position if signal == "velocity" else None)
+            if signal == "velocity":
+                leaps = of_joint.leaps()
+            for k in impossible.tolist():
+                before, after = spikes.rows[k]
+                if signal == "velocity":
+                    leaps[max(before, 0) : after] = False
+                elif leaps[max(before - 1, 0) : after + 1].any():
+                    continue
+                found.append(Corrupt(Break(before, after, "corrupt"), signal, joint, spikes.worst[k]))
     return found
 
 
@@ -101,7 +112,8 @@ class _Spikes:
         if position is None:
             return np.flatnonzero(far | unfilled)
         contradicted, confirmed = self._compared(position, others)
-        contradicted &= self.sizes > _LARGE * np.ptp(rest) if len(rest) else False
+        empty = np.array([not self._inside(rows).any() for rows in self.rows])
+        contradicted &= empty | (self.sizes > _LARGE * np.ptp(rest) if len(rest) else False)
         return np.flatnonzero(contradicted | ((far | unfilled) & ~confirmed))
 
     def _unfilled(self) -> np.ndarray:

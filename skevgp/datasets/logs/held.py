@@ -20,6 +20,7 @@ from .recording import Signals
 from .signals import whole_steps
 
 _LONGER = 6  # times as many rows as the usual frame
+_MOST = 10  # steps before the repeats that give the speed
 _SIDE = 3  # steps on each side with which a leap is compared
 _LEAP = 3.0  # times the largest of them
 _FACTOR = 2.0  # rates that differ by less are about the same
@@ -78,7 +79,7 @@ def _moves(
             return True
     recorded = float(velocity[first])
     is_seen = abs(recorded) * (time[after - 1] - time[first]) > _least(position)
-    return is_seen and _is_between(recorded, np.array([rate(position, first - rows, first)]))
+    return is_seen and _is_between(recorded, np.array([rate(position, first - min(rows, _MOST), first)]))
 
 
 def _is_between(value: float, others: np.ndarray) -> bool:

@@ -315,6 +315,10 @@ class Steps:
                 found.append((first, last + 2 + int(broken[0]) if len(broken) else len(self.d) + 1))
         return found
 
+    def leaps(self) -> np.ndarray:
+        """Return which steps (n - 1,) are far larger than those next to them."""
+        return self._lonely(_FEW_COUNTS * self.resolution)[0]
+
     def _lonely(self, least: float) -> tuple[np.ndarray, np.ndarray]:
         """Return which steps are far larger than those next to them, and at least so large, and by how much."""
         middle, deviation = self._neighbours(self.d, same_direction=True)

@@ -54,6 +54,6 @@ def check_publishers(rows: Signals, numbers: np.ndarray, names: Sequence[str], w
         same = rows.time[at] == rows.time[at + 1]
         raise ValueError(
             f"positions of joint {name!r} leap to and fro between two levels in {leaps.mean():.0%} of the record, "
-            f"first from {one} to {other}{', of the same time' if same else ''}. Two nodes may publish on one topic, or "
-            f"write to one file. {hint} Positions that really move like this are taken as they are with wrap=False."
+            f"first from {one} to {other}{', of the same time' if same else ''}. Several nodes may publish on one "
+            f"topic. {hint} Positions that really move like this are taken as they are with wrap=False."
         )
