@@ -187,8 +187,8 @@ def load_log(
     ------
     ValueError
         If a file cannot be read, or lacks columns, a topic or joints. If its signals contradict each other, are too
-        short for the filter, or are all at rest. If positions leap to and fro, as those of two publishers do. If files
-        differ in their joints, or an argument does not fit them. An error about a file begins with its name.
+        short for the filter, or are all at rest. If positions leap back and forth, as those of two publishers do. If
+        files differ in their joints, or an argument does not fit them. An error about a file begins with its name.
     TypeError
         If an argument is of the wrong type.
     OSError

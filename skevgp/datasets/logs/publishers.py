@@ -1,4 +1,4 @@
-"""Refuse a log in which two nodes publish the positions of one robot: positions leap to and fro between two levels."""
+"""Refuse a log with the messages of two nodes: positions leap back and forth between two levels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NEAR = 0.02  # of a period: levels that are so near to a whole number of period
 
 
 def check_publishers(rows: Signals, numbers: np.ndarray, names: Sequence[str], wrap: Sequence[Wish], hint: str) -> None:
-    """Raise if positions leap to and fro; rows are in order, with all rows of one time, and have these numbers.
+    """Raise if positions leap back and forth; rows are in order, with all rows of one time, and have these numbers.
 
     `hint` says how to choose one publisher.
     """
@@ -53,7 +53,7 @@ def check_publishers(rows: Signals, numbers: np.ndarray, names: Sequence[str], w
         one, other = (f"{position[row]:.4g} in row {numbers[row]}" for row in (at, at + 1))
         same = rows.time[at] == rows.time[at + 1]
         raise ValueError(
-            f"positions of joint {name!r} leap to and fro between two levels in {leaps.mean():.0%} of the record, "
+            f"positions of joint {name!r} leap back and forth between two levels in {leaps.mean():.0%} of the record, "
             f"first from {one} to {other}{', of the same time' if same else ''}. Several nodes may publish on one "
             f"topic. {hint} Positions that really move like this are taken as they are with wrap=False."
         )

@@ -337,7 +337,7 @@ def test_frame_id_chooses_one_of_two_publishers(tmp_path):
             message = TYPES[STATES](header(t + late, frame_id), ["a", "b"], *arrays)
             messages.append((t + late, message))
     file = write(tmp_path / "bag", {"/joint_states": (STATES, messages)})
-    with pytest.raises(ValueError, match=r"leap to and fro .* Choose one by frame_id: \['arm', 'mock'\]"):
+    with pytest.raises(ValueError, match=r"leap back and forth .* Choose one by frame_id: \['arm', 'mock'\]"):
         load_log(file)
     assert_recorded(load_log(file, frame_id="arm"))
     with pytest.raises(ValueError, match=r"frame_id='leg' is in no header; the messages have \['arm', 'mock'\]"):

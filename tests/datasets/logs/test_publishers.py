@@ -33,7 +33,7 @@ def zeros(rows, late):
 @pytest.mark.parametrize("derive", [False, True])
 def test_zeros_of_a_second_publisher_raise(load, every, derive):
     table = pendulum()
-    with pytest.raises(ValueError, match=r"log.csv: positions of joint 'q1' leap to and fro .* in row \d+ to .* in"):
+    with pytest.raises(ValueError, match=r"log.csv: positions of joint 'q1' leap back and forth .* in row \d+ to"):
         load(mixed(table, zeros(table[::every], 0.005)), velocity="derive" if derive else "recorded")
 
 
@@ -41,7 +41,7 @@ def test_zeros_of_a_second_publisher_raise(load, every, derive):
 def test_rows_of_one_time_that_contradict_each_other_raise(load, first):
     table = pendulum()
     pair = (zeros(table, 0.0), table) if first else (table, zeros(table, 0.0))
-    with pytest.raises(ValueError, match="leap to and fro .*, of the same time. Several nodes may publish"):
+    with pytest.raises(ValueError, match="leap back and forth .*, of the same time. Several nodes may publish"):
         load(mixed(*pair))
 
 
