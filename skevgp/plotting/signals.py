@@ -12,10 +12,20 @@ from ..utils.optional import require
 from ._style import BLUE, GREEN, PALETTE
 
 _PANELS = {"velocity": "velocity\n(rad/s)", "acceleration": "acceleration\n(rad/s²)", "torque": "torque\n(N m)"}
-_COLOURS = {"gap": "0.3", "jump": PALETTE[1], "rest": GREEN, "edge": PALETTE[4], "too short": PALETTE[3]}
+_COLOURS = {
+    "gap": "0.3",
+    "jump": PALETTE[1],
+    "corrupt": PALETTE[5],
+    "held": "0.6",
+    "rest": GREEN,
+    "edge": PALETTE[4],
+    "too short": PALETTE[3],
+}
 _WORDS = {
     "gap": "gap",
     "jump": "jump",
+    "corrupt": "cut: corrupt value",
+    "held": "cut: repeated frame",
     "rest": "cut: rest",
     "edge": "cut: filter's edge",
     "too short": "cut: too short",
@@ -182,8 +192,8 @@ def _of_joints(signals: Bunch, chosen: list[int]) -> Bunch:
 
 
 def _broken(raw: Bunch, cuts: Sequence[tuple[float, float, str]]) -> Bunch:
-    """Insert a row of NaN in each gap or jump, so that no line crosses it."""
-    gaps = np.searchsorted(raw.time, [first for first, _, why in cuts if why in ("gap", "jump")], side="right")
+    """Insert a row of NaN in each gap, jump or repeated frame, so that no line crosses it."""
+    gaps = np.searchsorted(raw.time, [first for first, _, why in cuts if why in ("gap", "jump", "held")], side="right")
     return Bunch(**{k: v if v is None else np.insert(v, gaps, np.nan, axis=0) for k, v in raw.items()})
 
 

@@ -28,9 +28,23 @@ _FIELDS = {
 _NANO = 1e-9
 
 
-def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignored: Collection[str] = ()) -> Recording:
+def read_bag(
+    path: Path,
+    topic: str | None,
+    joints: Sequence[str] | None,
+    ignored: Collection[str] = (),
+    frame_id: str | None = None,
+) -> Recording:
     """Read joint states or trajectories from a file, or from a folder with a metadata.yaml."""
     kind, received, messages = _messages(path, topic)
+    frames = sorted({message.header.frame_id for message in messages})
+    choice = f"Choose one by frame_id: {frames}." if len(frames) > 1 else ""
+    if frame_id is not None:
+        if frame_id not in frames:
+            raise ValueError(f"frame_id={frame_id!r} is in no header; the messages have {frames}.")
+        chosen = [message.header.frame_id == frame_id for message in messages]
+        received, messages = received[chosen], [one for one, mine in zip(messages, chosen, strict=True) if mine]
+        choice = ""
     if kind == _STATES:
         stamps = np.array([_nanoseconds(message.header.stamp) for message in messages], dtype=np.int64)
         times = stamps if stamps.all() else received  # a driver that leaves one out sets none that can be trusted
@@ -71,6 +85,7 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
         problems,
         refused,
         n_passed,
+        choice,
     )
 
 

@@ -19,7 +19,7 @@ from ...robots import RigidBody
 from ...robots.loading import Robot, known_robot
 from ...utils.validation import as_floats
 from .recording import Signals
-from .signals import Grid, Processing, pieces, process_piece
+from .signals import Break, Grid, Processing, pieces, process_piece
 
 _LARGEST = 0.1  # s: delays that are tried
 _COARSE, _FINE = 41, 21  # number of delays that are tried in all of the range, and around the best one
@@ -74,13 +74,13 @@ class RecordedRobot:
 
 
 def estimate_delay(
-    raw: Signals, step: float, gap: float, how: Processing, jumps: Sequence[tuple[int, int]], robot: RecordedRobot
+    raw: Signals, step: float, gap: float, how: Processing, breaks: Sequence[Break], robot: RecordedRobot
 ) -> float:
     """Return the delay of the efforts of a sorted recording, one for all joints, s; 0 if none is clear."""
     how.check_frequencies(step)
     cutoff = min(_CUTOFF, 0.2 / step) if how.cutoff is None else how.cutoff
     how = replace(how, cutoff=cutoff, dt=max(step, 1.0 / (_ROWS * cutoff)))
-    fit = _Regressions.of(raw, step, gap, how, jumps, robot)
+    fit = _Regressions.of(raw, step, gap, how, breaks, robot)
     if fit is None:
         return 0.0
     tried = np.linspace(-_LARGEST, _LARGEST, _COARSE)
@@ -116,12 +116,12 @@ class _Regressions:
         step: float,
         gap: float,
         how: Processing,
-        jumps: Sequence[tuple[int, int]],
+        breaks: Sequence[Break],
         robot: RecordedRobot,
     ) -> _Regressions | None:
         """Filter a recording; return None if no row is left."""
         grid, found = Grid.of(raw, step, how), []
-        for rows in pieces(raw.time, gap, jumps):
+        for rows in pieces(raw.time, gap, breaks):
             done = process_piece(raw.at(rows), grid, how)
             if done is not None:
                 signals, why = done

@@ -11,7 +11,7 @@ uses the recorded velocity, which a driver may have computed from the same wrapp
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 from ...robots import layout_of, load_robot
 from ...robots.loading import named_system
 from ...utils.validation import check_real
+from .signals import Break, merged, whole_steps
 
 RADIANS, DEGREES = 2.0 * np.pi, 360.0
 _SIDE = 3  # neighbours on each side of a step that predict it
@@ -31,6 +32,7 @@ _LOOSE, _TIGHT = 0.02, 0.002
 _FASTER = 4.0  # a jump is so many times the fastest step elsewhere
 _LONELY = 8.0  # ... and so many times what its neighbours deviate in its direction
 _COUNTS = 50.0  # ... and so many times the resolution of the positions
+_FEW_COUNTS = 10.0  # ... or of velocities and efforts
 _SMOOTH = 0.125  # of a period: 95 % of steps are predicted better than that where an angle is sampled well
 _STRONGEST = 1e3  # rad/s²: a step that a motor could make between two rows is no jump
 _RANGE = 0.9  # share of positions that gives their range; above a turn, units may be degrees or mm, with larger steps
@@ -50,7 +52,7 @@ class Jumps:
     position: np.ndarray  # (n, n_joints), unwrapped
     wraps: list[int]  # per joint: how many jumps were unwrapped
     periods: list[float | None]  # of each joint; None if it was not unwrapped
-    cuts: list[tuple[int, int]]  # last row before a jump of another size, first row after it
+    cuts: list[Break]  # at jumps of another size
     wrapped: np.ndarray  # (n - 1, n_joints) of bool: the steps that were unwrapped
 
 
@@ -120,16 +122,22 @@ def kinds_of(robot: Any, names: Sequence[str], named: bool) -> list[Kind]:
 
 
 def find_jumps(
-    time: np.ndarray, position: np.ndarray, step: float, gap: float, asked: Sequence[Wish], kinds: Sequence[Kind]
+    time: np.ndarray,
+    position: np.ndarray,
+    step: float,
+    gap: float,
+    asked: Sequence[Wish],
+    kinds: Sequence[Kind],
+    known: Sequence[Break] = (),
 ) -> Jumps:
-    """Unwrap angles, and find the jumps that are no wraps.
+    """Unwrap angles, and find the jumps that are no wraps; `known` are breaks that were found before.
 
     Across a gap, or a jump that is no wrap, the turn of an unwrapped angle is unknown: the next piece begins at the
     turn that is nearest to the end of the last one.
     """
     steps = np.diff(time)
-    whole = steps <= gap * (1.0 + 1e-9)
-    columns = [_Steps(steps, whole, column, step) for column in position.T]
+    whole = whole_steps(time, gap, known)
+    columns = [Steps(steps, whole, column, step) for column in position.T]
     resolutions = [column.resolution for column in columns]
     periods = _periods(columns, asked, kinds)
     done, wraps, broken = np.array(position, dtype=np.float64), [], []
@@ -161,12 +169,12 @@ def find_jumps(
         done,
         wraps,
         [period if count else None for period, count in zip(periods, wraps, strict=True)],
-        list(_merged(broken)),
+        merged([Break(*rows, "jump") for rows in broken], _SPIKE - 2),
         wrapped,
     )
 
 
-def _how(asked: Wish, kind: Kind, column: _Steps, period: float) -> str:
+def _how(asked: Wish, kind: Kind, column: Steps, period: float) -> str:
     """Return how much evidence of a wrap is needed: little if the user gives a period, or asks to unwrap.
 
     Positions that exceed one period may be in another unit. Then each of their steps looks like several periods.
@@ -176,7 +184,7 @@ def _how(asked: Wish, kind: Kind, column: _Steps, period: float) -> str:
     return "forced" if isinstance(asked, float) else "turns" if kind == "turns" else "any"
 
 
-def _periods(columns: Sequence[_Steps], asked: Sequence[Wish], kinds: Sequence[Kind]) -> list[float | None]:
+def _periods(columns: Sequence[Steps], asked: Sequence[Wish], kinds: Sequence[Kind]) -> list[float | None]:
     """Return the period of each joint that may be unwrapped; all joints of a log have the same unit."""
     wanted = [one is True or (one == "auto" and kind != "bounded") for one, kind in zip(asked, kinds, strict=True)]
     degrees = any(
@@ -189,7 +197,7 @@ def _periods(columns: Sequence[_Steps], asked: Sequence[Wish], kinds: Sequence[K
     ]
 
 
-class _Steps:
+class Steps:
     """The steps of one joint."""
 
     def __init__(self, steps: np.ndarray, whole: np.ndarray, position: np.ndarray, step: float):
@@ -206,10 +214,10 @@ class _Steps:
         sizes = np.abs(self.d[self.whole])
         return float(sizes[sizes > 0.0].min(initial=np.inf)) if (sizes > 0.0).any() else 0.0
 
-    def unwrapped(self, jumps: np.ndarray) -> _Steps:
+    def unwrapped(self, jumps: np.ndarray) -> Steps:
         """Subtract these jumps from the steps."""
         position = self.position - np.r_[0.0, np.cumsum(jumps)]
-        return _Steps(self.steps, self.whole, position, self.step)
+        return Steps(self.steps, self.whole, position, self.step)
 
     def turns(self, period: float, how: str) -> np.ndarray:
         """Count the periods in each step; 0 for motion.
@@ -268,11 +276,8 @@ class _Steps:
 
     def lone(self, resolution: float) -> list[tuple[int, int]]:
         """Return the last row before each jump and the first row after it."""
-        middle, deviation = self._neighbours(self.d, same_direction=True)
-        error = self.d - middle * self.steps
+        lone, error = self._lonely(_COUNTS * resolution)
         size = np.abs(error)
-        limit = np.maximum(_LONELY * deviation * self.lasting, _COUNTS * resolution)
-        lone = self.whole & np.isfinite(size) & (size > limit)
         if lone.any():
             low, high = np.quantile(self.position, [0.5 - _RANGE / 2.0, 0.5 + _RANGE / 2.0])
             lone &= 4.0 * size > _STRONGEST * max(1.0, (high - low) / RADIANS) * self.lasting**2
@@ -283,20 +288,54 @@ class _Steps:
             if not slower.any():
                 break
             lone &= ~slower
-        return self._grouped(np.flatnonzero(lone), error)
-
-    def _grouped(self, lone: np.ndarray, error: np.ndarray) -> list[tuple[int, int]]:
-        """Join steps away and back to one jump; return no jump if the joint moves only in such steps."""
-        groups: list[list[int]] = []
-        for index in lone.tolist():
-            if groups and index - groups[-1][-1] <= _SPIKE and self.whole[groups[-1][-1] : index].all():
-                groups[-1].append(index)
-            else:
-                groups.append([index])
-        away = sum(abs(error[group].sum()) > 0.5 * np.abs(error[group]).max() for group in groups)
+        # No jump is returned if the joint moves only in such steps.
+        groups = self._grouped(np.flatnonzero(lone), _SPIKE)
+        away = sum(not _returns(error[group]) for group in groups)
         if away > max(4, _MOST * np.count_nonzero(self.d)):
             return []
         return [(group[0], group[-1] + 1) for group in groups]
+
+    def spikes(self, longest: int) -> list[tuple[int, int]]:
+        """Return the last row before and the first row after values that leave their neighbours and come back.
+
+        They last at most `longest` rows. At the ends of a piece of the record, where values only leave or only come
+        back, they last at most as many rows as a jump away and back. The rows are then -1 or n, or those next to a gap.
+        """
+        lone, error = self._lonely(_FEW_COUNTS * self.resolution)
+        found = []
+        for group in self._grouped(np.flatnonzero(lone), longest):
+            first, last = group[0], group[-1]
+            if _returns(error[group]):
+                found.append((first, last + 1))
+            elif not self.whole[max(first - _SPIKE, 0) : first].all() or first < _SPIKE:
+                broken = np.flatnonzero(~self.whole[:first])
+                found.append((int(broken[-1]) if len(broken) else -1, last + 1))
+            elif not self.whole[last + 1 : last + 1 + _SPIKE].all() or last >= len(self.d) - _SPIKE:
+                broken = np.flatnonzero(~self.whole[last + 1 :])
+                found.append((first, last + 2 + int(broken[0]) if len(broken) else len(self.d) + 1))
+        return found
+
+    def leaps(self) -> np.ndarray:
+        """Return which steps (n - 1,) are far larger than those next to them."""
+        return self._lonely(_FEW_COUNTS * self.resolution)[0]
+
+    def _lonely(self, least: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return which steps are far larger than those next to them, and at least so large, and by how much."""
+        middle, deviation = self._neighbours(self.d, same_direction=True)
+        error = self.d - middle * self.steps
+        size = np.abs(error)
+        limit = np.maximum(_LONELY * deviation * self.lasting, least)
+        return self.whole & np.isfinite(size) & (size > limit), error
+
+    def _grouped(self, lone: np.ndarray, longest: int) -> list[list[int]]:
+        """Join steps away and back."""
+        groups: list[list[int]] = []
+        for index in lone.tolist():
+            if groups and index - groups[-1][-1] <= longest and self.whole[groups[-1][-1] : index].all():
+                groups[-1].append(index)
+            else:
+                groups.append([index])
+        return groups
 
     def _around(self, values: np.ndarray) -> np.ndarray:
         """Return the neighbours of each step, (2 * _SIDE, n - 1); NaN beyond a gap."""
@@ -333,15 +372,6 @@ class _Steps:
         return np.where(there, around, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
 
 
-def _merged(found: list[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Yield the jumps of all joints in order; jumps that touch are one."""
-    last: tuple[int, int] | None = None
-    for before, after in sorted(found):
-        if last is not None and before <= last[1] + _SPIKE - 2:
-            last = (last[0], max(last[1], after))
-            continue
-        if last is not None:
-            yield last
-        last = (before, after)
-    if last is not None:
-        yield last
+def _returns(steps: np.ndarray) -> bool:
+    """Whether steps lead back to where they began."""
+    return bool(abs(steps.sum()) <= 0.5 * np.abs(steps).max())

@@ -19,10 +19,13 @@ from ...utils.validation import as_floats, check_real
 from .agreement import check_agreement
 from .bags import SUFFIXES as BAGS
 from .bags import read_bag
+from .corrupt import Corrupt, find_corrupt
 from .delay import RecordedRobot, check_delay, estimate_delay
+from .held import find_held, rows_of
 from .jumps import Wish, check_wrap, find_jumps, kinds_of, wishes
+from .publishers import check_publishers
 from .recording import Recording, Signals, completed, naming
-from .signals import Processing, in_order, pieces, process, runs
+from .signals import Break, Processing, in_order, merged, pieces, process, runs
 from .tables import SECONDS, check_columns, read_table
 from .tables import SUFFIXES as TABLES
 
@@ -30,6 +33,8 @@ PathLike = str | os.PathLike[str]
 Columns = Mapping[str, int | str | Sequence[int | str]]
 _SINGULAR = 1e10  # condition number of a coupling, above which torques would be rounding
 _LATE = 0.002  # s: delays that are told
+_MOST_TOLD = 3  # corrupt values that a warning names
+_CHOICE = "Record one of them, or remove the rows of the others."
 
 Keep = slice | tuple[float | None, float | None]
 # True, False, "auto" or a period: for all joints, for each one, or by their names.
@@ -43,6 +48,7 @@ class _Options(TypedDict, total=False):
     time_unit: Literal["s", "ms", "us", "ns"]
     decimal: Literal[".", ","]
     topic: str | None
+    frame_id: str | None
     joints: Sequence[str] | None
     gains: ArrayLike
     coupling: ArrayLike | None
@@ -74,6 +80,7 @@ def load_log(
     time_unit: Literal["s", "ms", "us", "ns"] = "s",
     decimal: Literal[".", ","] = ".",
     topic: str | None = None,
+    frame_id: str | None = None,
     joints: Sequence[str] | None = None,
     gains: ArrayLike = 1.0,
     coupling: ArrayLike | None = None,
@@ -109,6 +116,9 @@ def load_log(
         Decimal sign of a table.
     topic : str, default=None
         Topic of a rosbag2 recording with joint states or joint trajectories. If None, the only such topic.
+    frame_id : str, default=None
+        ``frame_id`` in the headers of the messages to read from a rosbag2 recording, if several nodes publish on the
+        topic. If None, all messages.
     joints : sequence of str, default=None
         Joints to read from a rosbag2 recording, or names for the joints of a table. If None, all joints.
     gains : float or array-like of shape (n_joints,), default=1.0
@@ -152,13 +162,16 @@ def load_log(
         - ``data`` : ndarray of shape (n_rows, 3 * n_joints), with positions (rad or m), velocities and accelerations;
         - ``target`` : ndarray of shape (n_rows, n_joints), with torques (N m) or forces (N);
         - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
-        - ``pieces`` : ndarray of shape (n_rows,), with the piece of each row. A gap or rest begins a new piece;
+        - ``pieces`` : ndarray of shape (n_rows,), with the piece of each row. Any cut begins a new piece;
         - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
         - ``recordings`` : list of Bunch, one for each file, with
 
           - ``raw`` and ``processed``: Bunch of ``time``, ``position``, ``velocity``, ``acceleration`` and ``torque``.
             ``processed`` also has ``why``, which is ``"edge"`` or ``"rest"`` for rows that were cut;
           - ``cuts``: list of (first second, last second, reason);
+          - ``corrupt``: list of Bunch with the ``row``, ``joint``, ``signal`` and ``value`` of each corrupt velocity,
+            acceleration or effort. They are cut;
+          - ``n_held``: number of rows that repeat the frame before them while joints move. They are cut;
           - ``wrapped`` and ``periods``: dict of the number of unwrapped jumps, and of their periods, for each joint;
           - ``delay``: ndarray of shape (n_joints,), with the delays of the efforts in s;
           - ``start``: time of the first row by the clock of the file, s;
@@ -174,8 +187,8 @@ def load_log(
     ------
     ValueError
         If a file cannot be read, or lacks columns, a topic or joints. If its signals contradict each other, are too
-        short for the filter, or are all at rest. If files differ in their joints, or an argument does not fit them. An
-        error about a file begins with its name.
+        short for the filter, or are all at rest. If positions leap back and forth, as those of two publishers do. If
+        files differ in their joints, or an argument does not fit them. An error about a file begins with its name.
     TypeError
         If an argument is of the wrong type.
     OSError
@@ -186,7 +199,8 @@ def load_log(
     Warns
     -----
     RobotModelWarning
-        If ``delay="auto"`` finds a delay above 0.002 s. The delay is corrected.
+        If ``delay="auto"`` finds a delay above 0.002 s. The delay is corrected. If velocities, accelerations or efforts
+        are corrupt, or frames are repeated while joints move. These rows are cut.
 
     See Also
     --------
@@ -250,8 +264,10 @@ def load_log(
             if file.is_dir() or file.suffix.lower() in BAGS:
                 if asked is not None:
                     raise ValueError("columns is for tables. For a rosbag2 recording, choose topic and joints.")
-                read = read_bag(file, topic, names, ignored)
+                read = read_bag(file, topic, names, ignored, frame_id)
             else:
+                if frame_id is not None:
+                    raise ValueError(f"frame_id={frame_id!r} is for rosbag2 recordings, but the file is a table.")
                 read = _table(file, asked, time_unit, topic, names, decimal)
             names = read.joint_names
             wanted = wishes(wrap, names)
@@ -265,6 +281,7 @@ def load_log(
     assert names is not None
     if isinstance(delay, str):
         _warn_of_delays(recordings)
+    _warn_of_faults(recordings)
     log = _log(recordings, names, how)
     return (log.data, log.target) if return_X_y else log
 
@@ -313,6 +330,14 @@ def _kept(time: np.ndarray, keep: Keep | None) -> np.ndarray:
     return kept
 
 
+def _place(one: Corrupt, names: list[str], numbers: np.ndarray, signals: Signals, gains: np.ndarray) -> Bunch:
+    """Say where a corrupt value is in the file, and its value there."""
+    value, signal = float(getattr(signals, one.signal)[one.worst, one.joint]), one.signal
+    if signal == "torque":
+        value, signal = value / float(np.broadcast_to(gains, len(names))[one.joint]), "effort"
+    return Bunch(row=int(numbers[one.worst]), joint=names[one.joint], signal=signal, value=value)
+
+
 def _table(
     file: Path,
     columns: dict[str, list[int | str]] | None,
@@ -347,16 +372,28 @@ def _recording(
     delay: np.ndarray | RecordedRobot,
 ) -> Bunch:
     """Check and process the signals of a file; the delay is estimated if it is a robot."""
-    kept, n_incomplete = completed(read, _kept(read.signals.time, keep))
-    raw, step, gap = in_order(replace(kept, torque=kept.torque * motors.gains), how.max_gap, read.joint_names)
+    names, asked = read.joint_names, _kept(read.signals.time, keep)
+    kept, numbers = completed(read, asked)
+    raw = replace(kept, torque=kept.torque * motors.gains)
+    order, step, gap = in_order(raw, how.max_gap, names)
+    raw, numbers = raw.at(order), numbers[order]
     with np.errstate(all="ignore"):
-        found = find_jumps(raw.time, raw.position, step, gap, wrap, kinds)
-        raw = motors.joints(replace(raw, position=found.position))
-        parts, wrapped = list(pieces(raw.time, gap, found.cuts)), motors.steps_of_joints(found.wrapped)
-        _check_derivatives(raw, parts, read.joint_names, wrapped, how)
+        check_publishers(raw, numbers, names, wrap, read.choice or _CHOICE)
+        first_of_time = np.r_[True, np.diff(raw.time) > 0.0]
+        raw, numbers = raw.at(first_of_time), numbers[first_of_time]
+        held = find_held(raw, gap)
+        breaks = merged([Break(first, after, "held") for first, after in rows_of(held)], -1)
+        found = find_jumps(raw.time, raw.position, step, gap, wrap, kinds, breaks)
+        breaks = merged([*breaks, *found.cuts])
+        raw = replace(raw, position=found.position)
+        corrupt = find_corrupt(raw, step, gap, breaks)
+        breaks = merged([*breaks, *(one.where for one in corrupt)])
+        of_file, raw = raw, motors.joints(raw)
+        parts, wrapped = list(pieces(raw.time, gap, breaks)), motors.steps_of_joints(found.wrapped)
+        _check_derivatives(raw, parts, names, wrapped, how)
         if isinstance(delay, RecordedRobot):
-            delay = np.full(len(read.joint_names), estimate_delay(raw, step, gap, how, found.cuts, delay))
-        done = process(raw, step, gap, how, found.cuts, delay if delay.any() else None)
+            delay = np.full(len(names), estimate_delay(raw, step, gap, how, breaks, delay))
+        done = process(raw, step, gap, how, breaks, delay if delay.any() else None)
     for name, signal in vars(done.signals).items():
         if not np.isfinite(signal).all():
             raise ValueError(f"its {name} overflows when it is filtered and differentiated.")
@@ -364,7 +401,9 @@ def _recording(
         filename=str(file),
         start=read.start,
         n_repeated=len(kept.time) - len(raw.time),
-        n_incomplete=n_incomplete + read.n_passed,
+        n_incomplete=len(asked) - len(kept.time) + read.n_passed,
+        n_held=sum(after - first - 1 for first, after in rows_of(held)),
+        corrupt=[_place(one, names, numbers, of_file, motors.gains) for one in corrupt],
         raw=Bunch(**vars(raw)),
         processed=Bunch(**vars(done.signals), why=done.why),
         cuts=done.cuts,
@@ -429,6 +468,26 @@ def _warn_of_delays(recordings: list[Bunch]) -> None:
             "Pass delay=0.0 to keep the recorded times.",
             RobotModelWarning,
         )
+
+
+def _warn_of_faults(recordings: list[Bunch]) -> None:
+    """Warn of rows that were cut because a driver recorded wrong values."""
+    told = []
+    for one in recordings:
+        if one.corrupt:
+            places = [
+                f"the {its.signal} of joint {its.joint!r} in row {its.row} ({its.value:.5g})" for its in one.corrupt
+            ]
+            more = f" and {len(places) - _MOST_TOLD} more" if len(places) > _MOST_TOLD else ""
+            told.append(f"{one.filename}: corrupt values were cut: {', '.join(places[:_MOST_TOLD])}{more}.")
+        held = [cut for cut in one.cuts if cut[2] == "held"]
+        if held:
+            told.append(
+                f"{one.filename}: {one.n_held} rows repeat the frame before them while joints move, first at "
+                f"{held[0][0]:.4g} s. They were cut."
+            )
+    if told:
+        warn_user(" ".join(told), RobotModelWarning)
 
 
 def _check_derivatives(
@@ -505,6 +564,8 @@ def _story(recording: Bunch, length: int) -> str:
     incomplete = f"{recording.n_incomplete} incomplete at the ends; " if recording.n_incomplete else ""
     jumps = sum(why == "jump" for *_, why in cuts)
     cut_at = f"; positions jump {jumps} times" if jumps else ""
+    cut_at += f"; {len(recording.corrupt)} corrupt values" if recording.corrupt else ""
+    cut_at += f"; {recording.n_held} rows that repeat a frame" if recording.n_held else ""
     low, high = 1e3 * recording.delay.min(), 1e3 * recording.delay.max()
     moved = "" if low == high == 0.0 else f"; efforts moved earlier by {low:.3g} ms"
     moved += f" to {high:.3g} ms" if low != high else ""

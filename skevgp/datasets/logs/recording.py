@@ -46,10 +46,11 @@ class Recording:
     problems: Mapping[int, str] = field(default_factory=dict)
     refused: Mapping[int, str] = field(default_factory=dict)
     n_passed: int = 0  # messages at the beginning and end that do not name all joints
+    choice: str = ""  # how to choose one of several publishers
 
 
-def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
-    """Drop incomplete rows at the beginning and the end of the kept rows; return the others and how many were dropped.
+def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, np.ndarray]:
+    """Drop incomplete rows at the beginning and the end of the kept rows; return the others and their numbers.
 
     Drivers publish before the motors answer, tables have a line of units, and the last line may be cut off. An
     incomplete row between complete ones is an error. A velocity or acceleration that a joint never has does not count
@@ -90,7 +91,8 @@ def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
     if n_incomplete > len(whole):
         at = 0 if incomplete[0] else int(whole[-1]) + 1
         raise ValueError(f"{n_incomplete} of its {len(rows)} rows are incomplete: {told(at)}")
-    return kept.at(slice(whole[0], whole[-1] + 1)), n_incomplete
+    complete = slice(whole[0], whole[-1] + 1)
+    return kept.at(complete), rows[complete]
 
 
 @contextmanager

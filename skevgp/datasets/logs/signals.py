@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -20,6 +21,14 @@ _BAND = 0.8  # of the grid's Nyquist frequency is left where no cutoff is asked 
 _FINEST = 0.1  # of the median step: a finer grid has nothing to show
 
 Cut = tuple[float, float, str]
+
+
+class Break(NamedTuple):
+    """Where rows are cut out of a record. It may have no row, as a jump between two rows."""
+
+    before: int  # last row before it, -1 if there is none
+    after: int  # first row after it, n if there is none
+    why: str  # "jump", "corrupt" or "held"
 
 
 @dataclass(frozen=True)
@@ -60,8 +69,8 @@ class Processed:
     cuts: list[Cut]  # first and last second, and why
 
 
-def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple[Signals, float, float]:
-    """Sort rows by time and drop repeated times; return them, the median step and the longest step that is no gap.
+def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple[np.ndarray, float, float]:
+    """Sort rows by time; return their order, the median step and the longest step that is no gap.
 
     Messages overtake each other, so rows that are late by less than a gap are sorted. A clock that goes back by more is
     that of a second recording, which sorting would mix with the first.
@@ -89,20 +98,38 @@ def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple
             f"its clock goes back by {late.max():g} s at {raw.time[late.argmax()]:g} s: this is more than one "
             "recording. Choose one with keep, or split the file."
         )
-    return raw.at(order[np.r_[True, steps > 0.0]]), step, gap
+    return order, step, gap
 
 
-def pieces(time: np.ndarray, gap: float, jumps: Sequence[tuple[int, int]] = ()) -> Iterator[slice]:
-    """Yield the pieces of rows without a gap or a jump.
-
-    A jump is the last row before it and the first row after it. Rows between them are in no piece.
-    """
+def pieces(time: np.ndarray, gap: float, breaks: Sequence[Break] = ()) -> Iterator[slice]:
+    """Yield the pieces of rows without a gap or a break. Rows of a break are in no piece."""
     gaps = np.flatnonzero(np.diff(time) > gap * (1.0 + 1e-9))
     start = 0
-    for before, after in sorted([*jumps, *((row, row + 1) for row in gaps.tolist())]):
-        yield slice(start, before + 1)
-        start = after
-    yield slice(start, len(time))
+    for before, after, _ in sorted([*breaks, *(Break(row, row + 1, "gap") for row in gaps.tolist())]):
+        if before >= start:
+            yield slice(start, before + 1)
+        start = max(start, after)
+    if start < len(time):
+        yield slice(start, len(time))
+
+
+def whole_steps(time: np.ndarray, gap: float, breaks: Sequence[Break] = ()) -> np.ndarray:
+    """Return which of the steps (n - 1,) are in a piece."""
+    whole = np.diff(time) <= gap * (1.0 + 1e-9)
+    for before, after, _ in breaks:
+        whole[max(before, 0) : after] = False
+    return whole
+
+
+def merged(breaks: Sequence[Break], apart: int = 0) -> list[Break]:
+    """Sort breaks, and join those that touch or have at most so many more rows between them."""
+    found: list[Break] = []
+    for one in sorted(breaks):
+        if found and one.before <= found[-1].after + apart:
+            found[-1] = found[-1]._replace(after=max(found[-1].after, one.after))
+        else:
+            found.append(one)
+    return found
 
 
 def runs(flags: np.ndarray) -> Iterator[slice]:
@@ -116,7 +143,7 @@ def process(
     step: float,
     gap: float,
     how: Processing,
-    jumps: Sequence[tuple[int, int]] = (),
+    breaks: Sequence[Break] = (),
     delay: np.ndarray | None = None,
 ) -> Processed:
     """Filter and differentiate each piece of a sorted recording; raise if no row remains.
@@ -129,14 +156,14 @@ def process(
     grid = Grid.of(raw, step, how)
     dt = grid.h * grid.inside
     late, early = (0.0, 0.0) if delay is None else (max(delay.max(), 0.0), max(-delay.min(), 0.0))
-    before = -1
-    reached = {after for _, after in jumps}
-    for rows in pieces(raw.time, gap, jumps):
+    last = -1
+    into, out_of = {one.before: one.why for one in breaks}, {one.after: one.why for one in breaks}
+    for rows in pieces(raw.time, gap, breaks):
         piece = raw.at(rows)
         if rows.start > 0:
-            why_not = "jump" if rows.start in reached else "gap"
-            cuts.append((float(raw.time[before]), float(piece.time[0]), why_not))
-        before = rows.stop - 1
+            why_not = out_of.get(rows.start, into.get(last, "gap"))
+            cuts.append((float(raw.time[max(last, 0)]), float(piece.time[0]), why_not))
+        last = rows.stop - 1
         done = process_piece(piece, grid, how, delay)
         if done is None:
             cuts.append((float(piece.time[0]), float(piece.time[-1]), "too short"))
@@ -153,20 +180,32 @@ def process(
             for reason in ("edge", "rest")
             for run in runs(why == reason)
         )
+    if last < len(raw.time) - 1:
+        cuts.append((float(raw.time[max(last, 0)]), float(raw.time[-1]), into[last]))
     if not parts:
         lost = 2.0 * grid.edge * dt + late + early
-        jumping = (
-            f" Positions jump {len(jumps)} times, first at {raw.time[jumps[0][0]]:g} s, and each jump cuts it. "
-            "Positions that move in steps are taken as they are with wrap=False."
-            if jumps
-            else ""
-        )
-        raise ValueError(
-            f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends.{jumping}"
-        )
+        told = f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends."
+        raise ValueError(told + "".join(_told(why, breaks, raw.time) for why in _TOLD))
     if not any((why == "").any() for why in reasons):
         raise ValueError(f"all rows are at rest: no joint is faster than rest_velocity={how.rest_velocity:g}.")
     return Processed(_joined(parts), np.concatenate(reasons), sorted(cuts))
+
+
+_TOLD = {
+    "jump": "Positions jump {times}, first at {first:g} s, and each jump cuts it. Positions that move in steps are "
+    "taken as they are with wrap=False.",
+    "corrupt": "Velocities, accelerations or efforts are corrupt {times}, first at {first:g} s, and each time cuts it.",
+    "held": "Frames are repeated while the joints move {times}, first at {first:g} s, and each time cuts it.",
+}
+
+
+def _told(why: str, breaks: Sequence[Break], time: np.ndarray) -> str:
+    """Say how often a reason cuts the record."""
+    found = [one for one in breaks if one.why == why]
+    if not found:
+        return ""
+    times = f"{len(found)} time{'s' if len(found) > 1 else ''}"
+    return " " + _TOLD[why].format(times=times, first=time[max(found[0].before, 0)])
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,9 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
     the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
-    gap, a jump of a position or rest are left out, and so are rows with the time of another row. If `load_log`
-    had a ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay.
+    gap, a jump of a position, a corrupt value, a repeated frame or rest are left out, and so are rows with the time of
+    another row. If `load_log` had a ``delay``, the torque of a transition is the mean of the efforts that were recorded
+    later by this delay.
     :doc:`Learn the next state from your own logs </howto/next_state>` has an example, and one without velocities.
 
     Parameters
@@ -141,7 +142,7 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
     # Efforts that act in a step were recorded later by their delay.
     late = np.append(recording.delay, 0.0)
     for first, last, why in recording.cuts:
-        if why in ("gap", "rest", "jump"):
+        if why in ("gap", "rest", "jump", "corrupt", "held"):
             whole &= (raw.time[1:] <= first) | (raw.time[:-1] >= last)
         if why == "gap":
             whole &= (raw.time[1:] + late.max() <= first) | (raw.time[:-1] + late.min() >= last)

@@ -70,3 +70,24 @@ def states_of_db3(path):
         names = [text() for _ in range(take("I", 4))]
         signals.append([[take("d", 8) for _ in range(take("I", 4))] for _ in range(3)])
     return np.array(stamps), names, np.array(signals).transpose(1, 0, 2)
+
+
+PENDULUM = {"inertia": 0.25, "weight": 4.905, "viscous": 0.1, "coulomb": 0.3}
+
+
+def pendulum(step=0.01, duration=20.0, noise=0.02):
+    """Rows of time, position, velocity and effort of a pendulum with friction."""
+    t = np.arange(0.0, duration, step)
+    q = np.sin(t) + 0.4 * np.sin(2.7 * t)
+    dq = np.cos(t) + 1.08 * np.cos(2.7 * t)
+    ddq = -np.sin(t) - 2.916 * np.sin(2.7 * t)
+    effort = np.column_stack([ddq, np.sin(q), dq, np.sign(dq)]) @ list(PENDULUM.values())
+    return np.column_stack([t, q, dq, effort + noise * np.random.default_rng(0).standard_normal(len(t))])
+
+
+def identified(log):
+    """The pendulum's parameters by least squares, without the rows in which friction changes its sign."""
+    (q, dq, ddq), effort = log.data.T, log.target[:, 0]
+    moves = np.abs(dq) > 0.3
+    weights = np.linalg.lstsq(np.column_stack([ddq, np.sin(q), dq, np.sign(dq)])[moves], effort[moves], rcond=None)[0]
+    return dict(zip(PENDULUM, weights.tolist(), strict=True))

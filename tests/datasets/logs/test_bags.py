@@ -27,8 +27,8 @@ def stamp(nanoseconds, kind="builtin_interfaces/msg/Time"):
     return TYPES[kind](sec=int(nanoseconds // 10**9), nanosec=int(nanoseconds % 10**9))
 
 
-def header(nanoseconds):
-    return TYPES["std_msgs/msg/Header"](stamp=stamp(nanoseconds), frame_id="")
+def header(nanoseconds, frame_id=""):
+    return TYPES["std_msgs/msg/Header"](stamp=stamp(nanoseconds), frame_id=frame_id)
 
 
 def state(nanoseconds, names, q, dq=(), effort=()):
@@ -326,3 +326,19 @@ def test_messages_of_other_joints_are_passed_over(tmp_path):
     assert_recorded(load_log(file, joints=["a", "b"]))
     with pytest.raises(ValueError, match=r"messages have different joints, \[\('a', 'b'\), \('finger',\)\]"):
         load_log(file)
+
+
+def test_frame_id_chooses_one_of_two_publishers(tmp_path):
+    q, dq, _, current = motion(T)
+    messages = []
+    for row, t in enumerate((START + NS).tolist()):
+        for frame_id, share, late in (("arm", 1.0, 0), ("mock", 0.0, 1_000_000)):
+            arrays = (share * one[row] for one in (q, dq, current))
+            message = TYPES[STATES](header(t + late, frame_id), ["a", "b"], *arrays)
+            messages.append((t + late, message))
+    file = write(tmp_path / "bag", {"/joint_states": (STATES, messages)})
+    with pytest.raises(ValueError, match=r"leap back and forth .* Choose one by frame_id: \['arm', 'mock'\]"):
+        load_log(file)
+    assert_recorded(load_log(file, frame_id="arm"))
+    with pytest.raises(ValueError, match=r"frame_id='leg' is in no header; the messages have \['arm', 'mock'\]"):
+        load_log(file, frame_id="leg")

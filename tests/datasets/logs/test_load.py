@@ -82,6 +82,7 @@ def test_description_tells_what_was_done(files):
         ({"joints": ["a", "a"]}, r"joints must be a list of different names; got \['a', 'a'\]"),
         ({"joints": "ab"}, "joints must be a list of different names; got 'ab'"),
         ({"topic": "/a"}, "first.csv: topic='/a' is for rosbag2 recordings"),
+        ({"frame_id": "a"}, "first.csv: frame_id='a' is for rosbag2 recordings"),
         ({"columns": None}, "first.csv: pass columns=.*where a table has its signals"),
         ({"keep": (3.0, 2.0)}, r"keep=\(3.0, 2.0\): the first second must be below the last"),
         ({"keep": (1.0,)}, r"keep must be slice\(first row, stop row\) or \(first second, last second\); got \(1.0,\)"),
@@ -140,7 +141,7 @@ def test_other_kinds_of_files_raise(tmp_path, name, message):
 
 def test_signals_that_overflow_raise(tmp_path):
     table = table_of(irregular_times(3.0))
-    table[100, 6] = 1e308  # a position would be cut out as a jump
+    table[100:110, 6] = 1e308  # shorter, it would be cut as corrupt
     path = write_table(tmp_path / "log.csv", table)
     with pytest.raises(ValueError, match=r"log\.csv: its \w+ overflows when it is filtered and differentiated"):
         load_log(path, columns=BY_NUMBER)
