@@ -90,7 +90,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     n_iter_no_change : int, default=10
         Number of epochs without a gain on the held-out rows after which ``early_stopping`` ends the fit.
     n_samples : int, default=100
-        Number of draws of the weights for predictions. They are drawn once, at the end of `fit`.
+        Number of draws of the weights for predictions, at least 2. They are drawn once, at the end of `fit`.
     warm_start : bool, default=False
         Whether to start from the parameters of the last fit, if it had the same layers.
     random_state : int, RandomState instance or None, default=None
@@ -162,7 +162,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         "early_stopping": ["boolean"],
         "validation_fraction": [Interval(Real, 0, 1, closed="neither")],
         "n_iter_no_change": [Interval(Integral, 1, None, closed="left")],
-        "n_samples": [Interval(Integral, 1, None, closed="left")],
+        "n_samples": [Interval(Integral, 2, None, closed="left")],  # one draw has no spread
         "warm_start": ["boolean"],
         "random_state": ["random_state"],
         "verbose": ["verbose"],

@@ -306,7 +306,7 @@ def test_loss_that_does_not_stay_finite_warns(monkeypatch):
         ({"learning_rate_init": 0.0}, "learning_rate_init"),
         ({"validation_fraction": 1.0}, "validation_fraction"),
         ({"early_stopping": True, "validation_fraction": 0.999}, "leaves no rows for training"),
-        ({"n_samples": 0}, "n_samples"),
+        ({"n_samples": 1}, "n_samples"),
     ],
     ids=str,
 )
