@@ -101,3 +101,15 @@ def test_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noi
     samples = regressor.sample_y(X_NEW, 3000, random_state=0, include_noise=include_noise)
     far = samples[-2:].reshape(2 * 3, -1)  # where the weights say nearly all
     assert_allclose(np.corrcoef(far), joint[-6:, -6:] / np.outer(std[-2:], std[-2:]), atol=0.1)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("name", ["exact, several outputs", "sparse, shared weights"])
+def test_roots_without_noise_need_no_eigenvalues(name, monkeypatch):
+    """Eigenvalues take ten times as long as the samples with noise."""
+    regressor, y = MODELS[name]
+    regressor.fit(X, y)
+    monkeypatch.setattr("skevgp.utils.linalg.eigh", None)
+    rows = np.vstack([np.linspace(-1.0, 2.0, 200)[:, np.newaxis], X])
+    assert np.isfinite(regressor.sample_y(rows, include_noise=False)).all()
+    regressor.predict(rows, return_cov=True, include_noise=False)

@@ -8,8 +8,10 @@ from skevgp.utils.linalg import (
     NotPositiveDefiniteError,
     cholesky_of_covariance,
     cholesky_pullback,
+    covariance_root,
     jittered_cholesky,
     lower_transposed_times,
+    nearest_covariance,
     times_lower,
     triangular_inverse,
     triangular_product,
@@ -143,3 +145,45 @@ def test_solve_has_a_small_residual_however_ill_conditioned_the_factor(n, k):
     triangular_solve(L, X)
     assert (np.abs(L @ X - before) <= 4 * n * np.finfo(float).eps * (np.abs(L) @ np.abs(X))).all()
     np.testing.assert_array_equal(B[n:], rest)
+
+
+# --- roots of covariances ---------------------------------------------------------------------------------------------
+
+
+def of_rank(rank, n=80, seed=0):
+    """A covariance of rows that repeat and have different units."""
+    B = np.random.RandomState(seed).randn(n, rank)
+    B[n // 2 :] = B[: n - n // 2]
+    B *= np.logspace(-6, 3, n)[:, np.newaxis]
+    return B @ B.T
+
+
+def check_root(covariance, sizes, error):
+    F, by = covariance_root(covariance, sizes), np.sqrt(np.outer(sizes, sizes))
+    np.testing.assert_allclose(F @ F.T / by, covariance / by, rtol=0.0, atol=error)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", F, F), np.diag(covariance), rtol=1e-13)
+    nearest = nearest_covariance(covariance, sizes)
+    np.testing.assert_allclose(nearest / by, F @ F.T / by, rtol=0.0, atol=error)
+    np.testing.assert_array_equal(np.diag(nearest), np.diag(covariance))
+
+
+@pytest.mark.parametrize("rank", [0, 1, 3, 30])
+def test_root_of_a_singular_covariance_is_exact_to_rounding_in_all_units(rank):
+    A = of_rank(rank)
+    sizes = np.diag(A).copy() if rank else np.ones(len(A))
+    check_root(A, sizes, 40 * np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("share", [1e-4, 1e-9, 1e-13, 1e-15])
+def test_root_of_a_difference_has_rounding_errors_of_its_terms(share):
+    """A covariance that is a small share of the terms whose difference it is."""
+    n, noise = 80, np.random.RandomState(1).randn(80, 80)
+    x = np.linspace(0.0, 1.0, n)
+    A = share * np.exp(-0.5 * np.subtract.outer(x, x) ** 2 / 0.3**2)
+    A += np.finfo(float).eps * (noise + noise.T) * (1.0 - np.eye(n))
+    check_root(A, np.ones(n), n * 16 * np.finfo(float).eps)
+
+
+def test_root_of_an_indefinite_matrix_keeps_its_diagonal():
+    A = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 3.0]])  # nearest, scaled: correlation 1
+    np.testing.assert_allclose(nearest_covariance(A, np.diag(A)), [[1, 1, 0], [1, 1, 0], [0, 0, 3]], atol=1e-14)

@@ -84,6 +84,15 @@ def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
     )
 
 
+def test_adam_ends_on_few_rows_when_the_loss_is_flat():
+    """The optimum of q for a fixed kernel, which L-BFGS has in closed form."""
+    fixed = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], "fixed") + WhiteKernel(0.01, "fixed")
+    x, y, arguments = X[:5], Y[:5, 0], {"n_inducing": 2, "kernel": fixed, "noise_cv": None}
+    lbfgs, adam = (model(solver=solver, **arguments).fit(x, y) for solver in ("lbfgs", "adam"))
+    assert adam.n_iter_ < 2000
+    assert adam.lower_bound_ == pytest.approx(lbfgs.lower_bound_, abs=0.1)
+
+
 @pytest.mark.long
 def test_natural_gradients_and_lbfgs_agree_at_the_optimum():
     """Inducing points and noise free, mini-batches of a third of the rows."""

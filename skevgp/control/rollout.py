@@ -55,7 +55,8 @@ def rollout(
     n_steps : int, default=None
         Number of steps, only with a controller.
     n_samples : int, default=100
-        Number of particles for each initial state.
+        Number of particles for each initial state, at least 2 with ``method="sample"``. The other methods do not use
+        it.
     method : {"sample", "linearized", "mean"}, default="sample"
         - ``"sample"``: each particle follows one function drawn from the posterior.
         - ``"linearized"``: mean and covariance to first order, with independent steps.
@@ -72,14 +73,15 @@ def rollout(
         Values after each step, with a first axis of length n_batch if z0 has one:
 
         - mean, std : ndarray of shape (n_steps, n_states)
-        - covariance : ndarray of shape (n_steps, n_states, n_states)
+        - covariance : ndarray of shape (n_steps, n_states, n_states). That of samples has the divisor n_samples - 1
         - samples : ndarray of shape (n_samples, n_steps, n_states), with ``method="sample"``
         - inputs : ndarray of shape (n_steps, n_inputs), or (n_samples, n_steps, n_inputs) with samples and a controller
 
     Raises
     ------
     ValueError, TypeError
-        If shapes do not fit, a value is not finite, or the regressor has no ``return_std``.
+        If shapes do not fit, a value is not finite, or the regressor has no ``return_std``. If ``n_samples`` is too
+        small.
     NotFittedError
         If the regressor is not fitted.
 
@@ -109,7 +111,10 @@ def rollout(
         raise ValueError(f"method must be one of {_METHODS}; got {method!r}.")
     if process_noise not in _NOISES:
         raise ValueError(f"process_noise must be one of {_NOISES}; got {process_noise!r}.")
-    check_integer(n_samples, "n_samples", minimum=1)
+    if method == "sample":
+        check_integer(n_samples, 'n_samples of method="sample"', minimum=2)  # one particle has no spread
+    else:
+        check_integer(n_samples, "n_samples", minimum=1)
     states = _finite(z0, "z0")
     if states.ndim not in (1, 2) or 0 in states.shape:
         raise ValueError(f"z0 must be of shape (n_states,) or (n_batch, n_states); got {states.shape}.")
@@ -221,7 +226,7 @@ def _sampled(
     mean = samples.mean(axis=1)
     _warn_of_runaways(samples, batch)
     deviations = np.moveaxis(samples - mean[:, np.newaxis], 1, 3)  # (batch, steps, states, samples)
-    covariance = deviations @ np.swapaxes(deviations, 2, 3) / max(n_samples - 1, 1)
+    covariance = deviations @ np.swapaxes(deviations, 2, 3) / (n_samples - 1)
     found = {"mean": mean, "std": np.sqrt(np.einsum("btii->bti", covariance)), "covariance": covariance}
     driven = inputs.reshape(len(batch), n_samples, n_steps, -1) if drive.inputs is None else drive.inputs
     return {**found, "samples": samples, "inputs": driven}

@@ -161,6 +161,9 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     ) -> np.ndarray:
         """Draw functions from the posterior at some rows.
 
+        Samples have the covariance of `predict` with ``return_cov=True``. Memory is quadratic in the number of rows,
+        and time is cubic. For thousands of rows, use `sample_functions`, which is approximate but takes linear time.
+
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
@@ -182,6 +185,10 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         ValueError, TypeError
             If X does not fit the training data, is not finite or is a Dask array, or ``n_samples`` is not a positive
             integer.
+
+        See Also
+        --------
+        sample_functions : Functions without noise that can be evaluated anywhere.
         """
         check_integer(n_samples, "n_samples", minimum=1)
         if not is_dask(X) and not self.__sklearn_is_fitted__():

@@ -36,6 +36,9 @@ from ..utils.validation import (
 
 # If max_iter is None: this many epochs, or more if they make fewer steps than this.
 _EPOCHS, _STEPS = 100, 5000
+# Steps that become small lower the loss by a few tol, also if more steps would gain little. It still falls at the end
+# if it fell by more than so many tol over the last third of the steps, or by more than this share of its fall so far.
+_LAST_FALL, _LAST_SHARE = 10.0, 0.2
 # Rows per step if batch_size is "auto".
 _BATCH_SIZE = 200
 # Maximum number of floats in a layer of a prediction.
@@ -90,7 +93,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     n_iter_no_change : int, default=10
         Number of epochs without a gain on the held-out rows after which ``early_stopping`` ends the fit.
     n_samples : int, default=100
-        Number of draws of the weights for predictions. They are drawn once, at the end of `fit`.
+        Number of draws of the weights for predictions, at least 2. They are drawn once, at the end of `fit`.
     warm_start : bool, default=False
         Whether to start from the parameters of the last fit, if it had the same layers.
     random_state : int, RandomState instance or None, default=None
@@ -162,7 +165,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         "early_stopping": ["boolean"],
         "validation_fraction": [Interval(Real, 0, 1, closed="neither")],
         "n_iter_no_change": [Interval(Integral, 1, None, closed="left")],
-        "n_samples": [Interval(Integral, 1, None, closed="left")],
+        "n_samples": [Interval(Integral, 2, None, closed="left")],  # one draw has no spread
         "warm_start": ["boolean"],
         "random_state": ["random_state"],
         "verbose": ["verbose"],
@@ -227,7 +230,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Warns
         -----
         ConvergenceWarning
-            If the loss still fell in the last epoch, did not stay finite, or Ctrl-C ended the fit.
+            If the loss still fell much when ``max_iter`` epochs were used up: over the last third of the steps, by ten
+            times ``tol`` or by a fifth of its fall so far. If the loss did not stay finite, or Ctrl-C ended the fit.
         """
         with unchanged_if_it_fails(self), single_threaded_libraries():
             inputs, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64)
@@ -421,7 +425,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         theta = minimum.x if watch is None or watch.theta is None else watch.theta
         losses, scores = np.array(minimum.loss_curve), np.array([] if watch is None else watch.scores)
         epochs = np.array([losses[first : first + steps].mean() for first in range(0, len(losses), steps)])
-        still_falls = minimum.n_iter == max_iter * steps and not is_flat(losses, self.tol)
+        still_falls = minimum.n_iter == max_iter * steps and _still_falls(losses, self.tol)
         message = _STILL_FELL.format(max_iter=max_iter, tol=self.tol) if still_falls else ""
         return theta, epochs, scores, message if minimum.converged else _NOT_FINITE
 
@@ -445,6 +449,15 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         size = max(1, _NUMBERS_AT_ONCE // (len(weights[0]) * max(drawn.shape[2] for drawn in weights)))
         for first in range(0, len(X), size):
             yield self._network.functions(self._theta, weights, self._scaling.inputs(X[first : first + size]))
+
+
+def _still_falls(losses: np.ndarray, tol: float) -> bool:
+    """Whether the loss fell much over the last third of the steps, or by a large share of its fall so far."""
+    n = len(losses) // 3
+    if n == 0 or is_flat(losses, tol):
+        return n == 0
+    first, middle, last = (float(np.median(part)) for part in (losses[:n], losses[-2 * n : -n], losses[-n:]))
+    return middle - last > min(_LAST_FALL * tol, _LAST_SHARE * (first - last))
 
 
 class _EarlyStopping:

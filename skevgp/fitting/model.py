@@ -38,6 +38,8 @@ _GROWTH = 1.5
 _ROUNDING = 1e-13
 # The tolerance of L-BFGS, in nats: this, or this share of the gain over features and noise alone if that is more.
 LEAST_TOL, ENOUGH = 0.01, 1.5e-5
+# The tolerance for a flat loss of mini-batches: in nats, or in nats per row if that is more.
+_FLAT, _FLAT_PER_ROW = 0.1, 0.005
 # Relative size of the rounding errors in a bound on all rows.
 _BOUND_ROUNDING = 1e-8
 # Length of the natural gradient steps of q: the first, and the smallest.
@@ -429,6 +431,7 @@ class Model:
         """Run a solver that sees mini-batches."""
         solver: Any = self.problem.solver
         n_rows, tol = self.rows.total, LEAST_TOL if self.tol is None else self.tol
+        flat = max(_FLAT, _FLAT_PER_ROW * n_rows) if self.tol is None else tol
         elbo = ElboObjective(self.sparse, table, self.blocks, _NATURAL_RATES if solver.natural_gradient else None)
         first = elbo.table.start()
         minimum: Minimum = solver.minimise(
@@ -436,7 +439,7 @@ class Model:
             first,
             elbo.table.limits(),
             start.until,
-            tol / n_rows,
+            flat / n_rows,
             self.monitor.seen_as(factor=n_rows),
             elbo.pace,
         )

@@ -286,10 +286,10 @@ class Predictor:
         The diagonal is the variance from `predict`. The matrices are positive semi-definite up to rounding. ``noise``
         (o,) is added to the diagonal: with σ² it is the covariance of y.
         """
-        mean, own, common = self._own_covariances(inputs, features, noise)
+        mean, own, sizes, common = self._own_covariances(inputs, features, noise)
         covariance = np.empty((len(mean), *mean.shape))
-        for output, (matrix, shared) in enumerate(zip(own, common, strict=True)):
-            covariance[:, :, output] = nearest_covariance(matrix) + shared.T @ shared
+        for output, (matrix, size, shared) in enumerate(zip(own, sizes, common, strict=True)):
+            covariance[:, :, output] = nearest_covariance(matrix, size) + shared.T @ shared
         return mean, covariance
 
     def sample(
@@ -301,39 +301,45 @@ class Predictor:
         rng: np.random.RandomState,
     ) -> np.ndarray:
         """Draws (n, o, n_samples) from the distribution with the moments of `covariance`."""
-        mean, own, common = self._own_covariances(inputs, features, noise)
+        mean, own, sizes, common = self._own_covariances(inputs, features, noise)
         # Outputs that share their weights share one draw of them. Their other parts are independent.
         of_weights = rng.standard_normal((common.shape[1], n_samples))
         samples = [
-            own_mean[:, np.newaxis] + covariance_root(matrix) @ rng.standard_normal((len(mean), n_samples))
-            for own_mean, matrix in zip(mean.T, own, strict=True)
+            own_mean[:, np.newaxis] + covariance_root(matrix, size) @ rng.standard_normal((len(mean), n_samples))
+            for own_mean, matrix, size in zip(mean.T, own, sizes, strict=True)
         ]
         return np.stack([each + shared.T @ of_weights for each, shared in zip(samples, common, strict=True)], axis=1)
 
     def _own_covariances(
         self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean (n, o), covariance (o, n, n) without the part of shared weights, and the root (o, k, n) of that part."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Mean (n, o), covariance (o, n, n) without the part of shared weights, and the root (o, k, n) of that part.
+
+        The third array has the sizes (o, n) of the terms on the diagonal of the covariance.
+        """
         size, n = self.rows_at_once, len(inputs)
         # In parts as in `predict`, because rounding depends on the number of rows.
         parts = [self.predict(inputs[i : i + size], features[i : i + size], True) for i in range(0, n, size)]
         mean, variance = (np.concatenate(each) for each in zip(*parts, strict=True))
         projected = list(self.projected(inputs, features))
         common = self._common(projected)
-        covariances = np.empty((len(self.noise), n, n))
+        covariances, sizes = np.empty((len(self.noise), n, n)), np.empty((len(self.noise), n))
         p = common.shape[1]
         for group, own in zip(self.groups, projected, strict=True):
             V = own.P[: len(group.points)]
-            unexplained = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix() - V.T @ V
-            found = np.empty((len(group.signal), n, n))
-            for matrix, signal, root in zip(found, group.signal, group.root, strict=True):
+            K = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix()
+            prior, unexplained = diagonal_of(K), K - V.T @ V
+            found, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
+            for matrix, own_sizes, signal, root in zip(found, terms, group.signal, group.root, strict=True):
                 deviation = root[: len(root) - p] @ own.P
                 matrix[...] = signal * unexplained + deviation.T @ deviation
-            covariances[group.outputs] = found
-        diagonals = (variance + noise).T - np.square(common).sum(axis=1)
+                own_sizes[...] = signal * prior + np.square(deviation).sum(axis=0)
+            covariances[group.outputs], sizes[group.outputs] = found, terms
+        of_weights = np.square(common).sum(axis=1)
+        diagonals, sizes = (variance + noise).T - of_weights, sizes + of_weights
         for matrix, diagonal in zip(covariances, diagonals, strict=True):
             diagonal_of(matrix)[...] = np.maximum(diagonal, 0.0)
-        return mean, covariances, common
+        return mean, covariances, sizes, common
 
     def novelty(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Var[f(x) | data] / Var[f(x)] (n, o)."""

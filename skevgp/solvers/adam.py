@@ -16,8 +16,9 @@ from .base import Callback, Limits, MiniBatchSolver, Minimum, Objective
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
 # Largest entry of a gradient. The square of a larger one overflows, after which no step moves.
 _LARGEST = 1e150
-# Number of steps between two tests for a plateau, and before the first last steps.
-_WINDOW, _FEWEST = 50, 1500
+# Number of steps between two tests for a plateau. Fewest steps before the last steps if the loss is flat up to the
+# tolerance, and if it is flat up to chance, which more steps tell from slow progress.
+_WINDOW, _FEWEST, _FEWEST_BY_CHANCE = 50, 600, 1500
 
 
 class Adam(MiniBatchSolver):
@@ -50,7 +51,7 @@ class Adam(MiniBatchSolver):
         at least as high, and predictions are the same. See :doc:`/guide/bounds`.
     tol : float or "auto", default="auto"
         Tolerance in nats. Adam begins its last steps when the median loss over a third of the steps changes by less. If
-        ``"auto"``, 0.01.
+        ``"auto"``, 0.005 per row, and at least 0.1.
     max_time : float, default=None
         Number of seconds until steps end, as in `LBFGS`.
 
@@ -172,8 +173,9 @@ def adam(
     # The cosine is planned for max_iter steps (if steps are constant, there is none at first). When the loss stays
     # flat, a last, shorter cosine begins: from the present step size to zero, in as many steps as came before. The loss
     # is flat if its median over the last third of the steps differs from that over the third before by less than tol,
-    # or by less than twice its standard error. It stays flat if it was so throughout the last third of the steps. A
-    # loss that rises is a sign of steps that are too large, not of convergence, so that the first cosine goes on.
+    # or by less than twice its standard error. Without mini-batches, losses have no such error, so that tol decides.
+    # The loss stays flat if it was so throughout the last third of the steps. A loss that rises is a sign of steps that
+    # are too large, not of convergence, so that the first cosine goes on.
     #
     # objective is called with the next mini-batch each time; pace(share) before each step with its size as a share of
     # the first; stop(x) after each step returns whether it was the last. The result has the last point. If the loss did
@@ -183,7 +185,8 @@ def adam(
     x = np.clip(start, *limits)
     minimum, best = Minimum(x, np.inf), _BestSoFar(x)
     first, second = np.zeros_like(x), np.zeros_like(x)
-    since, until, highest, flat_from = 0, max_iter, 1.0, 0
+    since, until, highest = 0, max_iter, 1.0
+    plateaus = _Plateau(_FEWEST, tol, chance=False), _Plateau(_FEWEST_BY_CHANCE, tol, chance=True)
     with monitor.keeping_the_best(), suppress(NotPositiveDefiniteError):
         while minimum.n_iter < until:
             share = highest
@@ -203,8 +206,9 @@ def adam(
             x = np.clip(x - learning_rate * share / (1.0 - _DECAY_FIRST**t) * first / scale, *limits)
             monitor.iteration(t, loss)
             if t % _WINDOW == 0 and t >= 3 * _WINDOW:
-                flat_from = (flat_from or t) if is_flat(np.array(minimum.loss_curve), tol) else 0
-                if flat_from > 0 and t >= _FEWEST and t - flat_from >= t // 3 and 2 * t < until:
+                losses = np.array(minimum.loss_curve)
+                reached = [plateau.reached(losses) for plateau in plateaus]
+                if any(reached) and 2 * t < until:
                     since, until, highest = t, 2 * t, share
             if stop is not None and stop(x):
                 until = t
@@ -221,13 +225,26 @@ def _median(losses: np.ndarray) -> tuple[float, float]:
     return float(median), 0.5 * np.pi * ((high - low) / 1.35) ** 2 / len(losses)
 
 
-def is_flat(losses: np.ndarray, tol: float) -> bool:
+def is_flat(losses: np.ndarray, tol: float, chance: bool = True) -> bool:
     """Whether the last third of the losses equals the third before, up to ``tol`` and chance."""
     n = len(losses) // 3
     if n == 0:
         return False
     (before, before_variance), (after, after_variance) = _median(losses[-2 * n : -n]), _median(losses[-n:])
-    return abs(before - after) < max(tol, 2.0 * np.sqrt(before_variance + after_variance))
+    error = np.sqrt(before_variance + after_variance) if chance else 0.0
+    return abs(before - after) < max(tol, 2.0 * error)
+
+
+class _Plateau:
+    """Whether losses are flat, and were so throughout the last third of at least ``fewest`` steps."""
+
+    def __init__(self, fewest: int, tol: float, chance: bool):
+        self._fewest, self._tol, self._chance, self._first = fewest, tol, chance, 0
+
+    def reached(self, losses: np.ndarray) -> bool:
+        t = len(losses)
+        self._first = (self._first or t) if is_flat(losses, self._tol, chance=self._chance) else 0
+        return self._first > 0 and t >= self._fewest and t - self._first >= t // 3
 
 
 class _BestSoFar:

@@ -12,6 +12,9 @@ from scipy.linalg import blas, eigh, lapack
 MAX_JITTER = 1e-2
 # Directions with a smaller share of a semi-definite matrix than this are rounding errors.
 _NO_DIRECTION = 1e-12
+# Pivots of a semi-definite matrix are rounding errors up to the first of these tolerances, if its terms have a diagonal
+# of 1. It is raised up to the second while a variance grows by more than the third times the tolerance.
+_ROUNDING, _MOST_ROUNDING, _GROWTH = 16.0 * np.finfo(float).eps, 1e-8, 10.0
 # Number of rows of a triangular matrix to multiply at once.
 _BAND = 48
 
@@ -80,29 +83,76 @@ def semidefinite_inverse(matrix: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return root @ root.T
 
 
-def covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """Return a root F (n, n) of a covariance matrix that rounding errors may have made indefinite."""
-    # F is the Cholesky factor if there is one. Otherwise F Fᵀ is the nearest positive semi-definite matrix (Higham
-    # 1988, "Computing a nearest symmetric positive semidefinite matrix"). Dropping negative eigenvalues increases the
-    # diagonal, so that rows and columns are scaled to keep it.
+def covariance_root(covariance: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return a root F (n, n) of a covariance matrix that rounding errors may have made indefinite.
+
+    ``sizes`` (n,) are the diagonal without cancellation of terms. F Fᵀ has the diagonal of the matrix. Its other
+    entries differ by rounding errors of sizes.
+    """
     factor = _cholesky_root(covariance)
-    if factor is not None:
-        return factor
-    values, vectors = eigh(covariance, check_finite=False)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    sizes = np.einsum("ij,ij->i", root, root)
-    shrink = np.divide(diagonal_of(covariance), sizes, out=np.zeros(len(sizes)), where=sizes > 0.0)
-    return root * np.sqrt(shrink)[:, np.newaxis]
+    return _semidefinite_root(covariance, sizes)[0] if factor is None else factor
 
 
-def nearest_covariance(covariance: np.ndarray) -> np.ndarray:
+def nearest_covariance(covariance: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the matrix itself if it has a Cholesky factor, else F Fᵀ of `covariance_root`, with the same diagonal."""
     if _cholesky_root(covariance) is not None:
         return 0.5 * (covariance + covariance.T)
-    root = covariance_root(covariance)
-    found: np.ndarray = root @ root.T
+    root, rank = _semidefinite_root(covariance, sizes)
+    found: np.ndarray = root[:, :rank] @ root[:, :rank].T
     diagonal_of(found)[...] = diagonal_of(covariance)
     return found
+
+
+def _semidefinite_root(covariance: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return a root (n, n), and the number of its first columns that determine all entries except the diagonal."""
+    variances, n = diagonal_of(covariance), len(covariance)
+    # Rows are divided by the square roots of sizes, so that all entries have rounding errors of about the same size.
+    sizes = np.maximum(sizes, variances)
+    by = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+    scaled = covariance / by
+    scaled /= by[:, np.newaxis]
+    tol = _ROUNDING
+    while tol <= _MOST_ROUNDING:
+        found = _pivoted_root(scaled, tol)
+        if found is not None:
+            root, rank = found
+            root *= by[:, np.newaxis]
+            return root, rank
+        tol *= 10.0
+    # The nearest positive semi-definite matrix (Higham 1988, "Computing a nearest symmetric positive semidefinite
+    # matrix"). Dropping negative eigenvalues increases the diagonal, so that rows and columns are scaled to keep it.
+    values, vectors = eigh(covariance, check_finite=False)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    lengths = np.einsum("ij,ij->i", root, root)
+    shrink = np.divide(variances, lengths, out=np.zeros(n), where=lengths > 0.0)
+    return root * np.sqrt(shrink)[:, np.newaxis], n
+
+
+def _pivoted_root(matrix: np.ndarray, tol: float) -> tuple[np.ndarray, int] | None:
+    """Return `_semidefinite_root` by pivots above ``tol``, or None if some of these are rounding errors."""
+    # The Cholesky factor with complete pivoting ends at the rank r (Higham 2002, section 10.3), after about n r²
+    # operations. The Schur complement that is left has no entry above tol. It is replaced by its diagonal.
+    n, diagonal = len(matrix), diagonal_of(matrix)
+    factor, pivots, rank, _ = lapack.dpstrf(matrix.T, tol=tol, lower=1)
+    rank = rank if diagonal.max(initial=0.0) > tol else 0  # LAPACK takes the first pivot whatever its size
+    order, columns = pivots - 1, np.tril(factor[:, :rank])
+    own = diagonal[order]
+    grown = np.einsum("ij,ij->i", columns, columns) - own
+    # A pivot that is a rounding error makes other rows grow.
+    if not grown.max(initial=0.0) <= _GROWTH * tol:  # True if there is a NaN
+        return None
+    # Rows that grew keep their variance. They are scaled if they grew by the rounding errors of a sum. Otherwise each
+    # entry is at most what the entries before it leave.
+    little = (grown > 0.0) & (grown <= n * np.finfo(float).eps * own)
+    columns[little] *= np.sqrt(own[little] / (own[little] + grown[little]))[:, np.newaxis]
+    much = (grown > 0.0) & ~little
+    squares = columns[much] ** 2
+    most = np.maximum(own[much, np.newaxis] - (np.cumsum(squares, axis=1) - squares), 0.0)
+    columns[much] = np.copysign(np.sqrt(np.minimum(squares, most)), columns[much])
+    root = np.zeros((n, n))
+    root[order, :rank] = columns
+    root[order[rank:], np.arange(rank, n)] = np.sqrt(np.maximum(-grown[rank:], 0.0))
+    return root, rank
 
 
 def _cholesky_root(covariance: np.ndarray) -> np.ndarray | None:

@@ -103,6 +103,16 @@ def test_mean_is_fed_back(model, inputs):
     assert "samples" not in found
 
 
+@pytest.mark.parametrize("n_samples", [2, 5])
+def test_covariance_of_few_particles_is_unbiased(sparse, inputs, n_samples):
+    n_runs = 4000
+    found = rollout(sparse, np.tile(Z0, (n_runs, 1)), inputs[:1], n_samples=n_samples, random_state=0)
+    _, std = sparse.predict(np.hstack([Z0, inputs[0]])[np.newaxis], return_std=True)
+    # The variance of a normal distribution's sample variance is 2 / (n_samples - 1) times the square of its mean.
+    error = np.sqrt(2.0 / ((n_samples - 1) * n_runs))
+    np.testing.assert_allclose((found.std[:, 0] ** 2).mean(axis=0), std[0] ** 2, rtol=4.0 * error)
+
+
 @pytest.mark.parametrize("process_noise", ["learned", "none"])
 def test_linearised_covariance_goes_through_the_derivatives(sparse, inputs, process_noise):
     found = rollout(sparse, Z0, inputs, method="linearized", process_noise=process_noise)
@@ -240,6 +250,11 @@ def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_o
 def test_invalid_arguments_raise(sparse, arguments, options, message, method):
     with pytest.raises(ValueError, match=message):
         rollout(sparse, *arguments, **{"method": method, **options})
+
+
+def test_one_particle_raises(sparse, inputs):
+    with pytest.raises(ValueError, match='n_samples of method="sample" must be at least 2; got 1'):
+        rollout(sparse, Z0, inputs, n_samples=1)
 
 
 def test_invalid_regressors_raise(data, inputs):

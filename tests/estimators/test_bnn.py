@@ -278,6 +278,19 @@ def test_interruption_keeps_a_usable_model(monkeypatch):
     assert np.isfinite(m.predict(X_NEW)).all()
 
 
+def test_loss_that_still_falls_at_the_end_warns():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (60, 2))
+    y = np.sin(X[:, 0]) + 0.1 * rng.randn(60)
+    with pytest.warns(ConvergenceWarning, match="still fell when max_iter=30 "):
+        BayesianMLPRegressor((5,), max_iter=30, random_state=0).fit(X, y)
+    # Steps that become small lower the loss too.
+    model = BayesianMLPRegressor((5,), max_iter=1500, random_state=0).fit(X, y)
+    losses = model.loss_curve_
+    assert model.n_iter_ == 1500
+    assert np.median(losses[500:1000]) - np.median(losses[1000:]) > model.tol
+
+
 def test_loss_that_does_not_stay_finite_warns(monkeypatch):
     monkeypatch.setattr(VariationalNetwork, "loss_and_gradient", lambda self, theta, *_: (np.nan, theta))
     with pytest.warns(ConvergenceWarning, match="did not stay finite"):
@@ -306,7 +319,7 @@ def test_loss_that_does_not_stay_finite_warns(monkeypatch):
         ({"learning_rate_init": 0.0}, "learning_rate_init"),
         ({"validation_fraction": 1.0}, "validation_fraction"),
         ({"early_stopping": True, "validation_fraction": 0.999}, "leaves no rows for training"),
-        ({"n_samples": 0}, "n_samples"),
+        ({"n_samples": 1}, "n_samples"),
     ],
     ids=str,
 )
