@@ -9,6 +9,8 @@
     python benchmarks/speed.py million --fits reference    # a thousand iterations: much longer
     python benchmarks/speed.py checkout --other ../older   # fits by this checkout and by another one, in pairs
 
+    python benchmarks/speed.py checkout --other ../older --data ../data   # also torques of a real arm
+
 Each part takes seconds with --quick.
 
 *latency* has 100 inducing points, 6 columns and 4 outputs that share the points, on one thread. Times are medians over
@@ -53,6 +55,7 @@ from threadpoolctl import threadpool_limits
 
 import harness
 from harness import figure_of
+from one_fit import JOBS
 from peers.adapters import microseconds
 from peers.against_peers import work
 from skevgp import EVGPRegressor
@@ -463,27 +466,6 @@ def million_tables(rows: pd.DataFrame) -> harness.Tables:
 
 # --- checkout ------------------------------------------------------------------------------------------------------
 
-INDUCING = {"pendulum": 10, "cartpole": 60, "acrobot": 150}
-FIT = """
-import json, sys, time, warnings
-import numpy as np
-from skevgp import EVGPRegressor
-from skevgp.datasets import make_dynamics
-from skevgp.features import InertiaForceGravity
-from skevgp.metrics import negative_log_predictive_density, prediction_error
-system, n_inducing, n_trajectories, seed = json.loads(sys.argv[1])
-train, test = (make_dynamics(system, n_trajectories, random_state=state) for state in (seed, 1000 + seed))
-model = EVGPRegressor(InertiaForceGravity(system), n_inducing=n_inducing, random_state=seed)
-warnings.simplefilter("ignore")
-start, cpu_start = time.perf_counter(), time.process_time()
-model.fit(train.data, train.target, groups=train.groups)
-seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
-mean, std = model.predict(test.data, return_std=True)
-print(json.dumps(dict(seconds=seconds, cpu_seconds=cpu_seconds, n_iter=int(model.n_iter_),
-    bound=float(model.lower_bound_), error=float(prediction_error(test.target, mean)),
-    nlpd=float(negative_log_predictive_density(test.target, mean, std)))))
-"""
-
 Checkout = namedtuple("Checkout", "job checkout commit seed repeat")
 
 
@@ -493,7 +475,9 @@ def folders(options: Any) -> dict[str, Path]:
 
 
 def checkout_cells(options: Any) -> list[Checkout]:
-    jobs, seeds, commits = ["pendulum"] if options.quick else list(INDUCING), range(1 if options.quick else 4), {}
+    jobs, seeds, commits = options.jobs_of_checkout or [*JOBS, *(["ur10e"] if options.data else [])], range(3), {}
+    if options.quick:
+        jobs, seeds = ["pendulum"], range(1)
     for name, folder in folders(options).items():
         command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
         commits[name] = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
@@ -503,10 +487,12 @@ def checkout_cells(options: Any) -> list[Checkout]:
 
 def run_checkout(cell: Checkout, options: Any) -> dict[str, Any]:
     """Fit in a process that imports skevgp from the folder."""
-    job = json.dumps([cell.job, INDUCING[cell.job], 3 if options.quick else None, cell.seed])
+    command = [sys.executable, str(Path(__file__).with_name("one_fit.py")), cell.job, str(cell.seed)]
+    command += ["--quick"] if options.quick else []
+    command += ["--data", str(options.data.resolve())] if options.data else []
     environment = os.environ | {"PYTHONPATH": str(folders(options)[cell.checkout])}
     told = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
-    return json.loads(subprocess.run([sys.executable, "-c", FIT, job], **told).stdout.splitlines()[-1])
+    return json.loads(subprocess.run(command, **told).stdout.splitlines()[-1])
 
 
 def checkout_tables(rows: pd.DataFrame) -> harness.Tables:
@@ -548,6 +534,8 @@ def main() -> None:
     parser.add_argument("--peer-python", help="of latency: a Python that has GPflow and GPyTorch")
     parser.add_argument("--fits", nargs="+", choices=FITS, help="of million; default: all but the reference")
     parser.add_argument("--other", type=Path, help="of checkout: folder of the other checkout; default: this one")
+    parser.add_argument("--fits-of", nargs="+", dest="jobs_of_checkout", choices=[*JOBS, "ur10e"], help="of checkout")
+    parser.add_argument("--data", type=Path, help="of checkout: a folder with the logs of the UR10e (see robots.py)")
     options = harness.parse(parser)
     name, cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, name)
