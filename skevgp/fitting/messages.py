@@ -102,9 +102,9 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows, names: Sequence[str]) ->
     """Message that y, or a weight, is too far from its prior mean. ``names`` are those of the first weights."""
     # Residuals that are rounding errors of y are not of size one. The range shows their size even if a few rows have
     # almost all of the precision.
-    y = rows.residuals
-    size = np.maximum(np.sqrt(y.variance), _STD_OF_RANGE * (y.highest - y.lowest))
-    if (size < np.minimum(np.abs(y.mean), 1.0) / _FAR)[rows.columns].any():
+    y, own = rows.residuals, rows.columns
+    size = np.maximum(np.sqrt(rows.scatter() / rows.mean_precision), _STD_OF_RANGE * (y.highest - y.lowest)[own])
+    if (size < np.minimum(np.abs(y.mean[own]), 1.0) / _FAR).any():
         return (
             f"y is more than {_FAR:g} times its scatter away from its prior mean of 0, which leaves the kernel little "
             "accuracy for the rest. Set normalize_y=True, or add an intercept to the feature_map."

@@ -47,7 +47,7 @@ def pull(X, rate):
     return anp.sin(rate * X[:, 0])
 
 
-PULL = ParametricFeatures(pull, {"rate": LogNormal(0.8, 0.3)})
+PULL = ParametricFeatures(pull, {"rate": LogNormal(0.8, 1.0)})
 REGRESSORS = {
     "sparse": EVGPRegressor(n_inducing=15, **QUICK),
     "features": EVGPRegressor(FunctionTransformer(), kernel_map=StandardScaler(), n_inducing=15, **QUICK),
