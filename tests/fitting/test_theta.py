@@ -481,6 +481,17 @@ def test_parameter_at_the_edge_of_its_prior_warns():
     assert model.theta_["period"] == pytest.approx(2.2, abs=0.01)
 
 
+@pytest.mark.parametrize("prior", ["auto", CoefPrior(mean=[2.0], scale=0)], ids=["free", "fixed"])
+def test_parameter_far_outside_of_its_prior_warns_by_name(prior):
+    """The frequency is 1.5. A prior scale of 0 is the user's choice, and no reason for another warning."""
+    rows = np.random.RandomState(0).uniform(-3.0, 3.0, (100, 1))
+    features = ParametricFeatures(lambda X, frequency: anp.sin(frequency * X), {"frequency": LogNormal(1.0, 0.1)})
+    with pytest.warns(ConvergenceWarning) as caught:
+        model = EGPRegressor(features, coef_prior=prior).fit(rows, 2.0 * np.sin(1.5 * rows[:, 0]))
+    assert ["['frequency'] ended at the edges" in str(one.message) for one in caught] == [True]
+    assert model.theta_["frequency"] == pytest.approx(1.5, abs=0.01)
+
+
 def test_theta_of_another_model_is_explained():
     with pytest.raises(AttributeError, match="theta_ only after a fit with a feature_map that has parameters"):
         _ = sparse(FunctionTransformer()).fit(X, Y).theta_
