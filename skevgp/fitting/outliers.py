@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..data.rows import LocalSource, Rows
+from ..data.rows import LocalSource, RawRows, Rows
 from ..model.model import SparseModel
 from ..model.parameters import Values
 from ..model.predictor import Predictor
 from ..noise.base import RowScales
 from .model import ENOUGH, LEAST_TOL, Model
-from .robust import errors_of_medians, ordinary_variance
+from .robust import Neighbours, ordinary_variance
 from .search import Fit, Start, better, search
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _LOOK_ITERATIONS, _LOOK_ROWS, _LOOK_ROWS_PER_POINT = 30, 2000, 10
 # The median of the square of a standard normal number.
 _MEDIAN_SQUARE = 0.4549
 # If more than this share of the rows seem to be outliers, the first scales are all 1.
-_FEW = 0.3
+_FEW = 0.2
 # Share of the iterations before scales are estimated again, and then the number of iterations between estimates.
 _BEFORE, _BETWEEN = 2.0 / 3.0, 50
 # Scales and q alternate until no E[τ] changes by more than this share, or so many times.
@@ -42,6 +42,8 @@ _PATIENCE = 3.0
 _FAR = 6.0
 # In the first short fit, which outliers may pull, rows count as outliers from so many standard deviations.
 _FAR_FROM_MEDIAN = 3.0
+# Fewer rows than this do not show which share of them is far off.
+_FEWEST_ROWS = 20
 # Number of rows that are predicted at once.
 _ROWS_AT_ONCE = 4096
 
@@ -141,7 +143,8 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
                 fit = replace(fit, converged=True, message="")
     # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
     weighed = replace(weighed, rows=doubts.weigh(rows))
-    doubts = replace(doubts, far=look_at(rows, predictor_at(weighed, fit.values)).far_from_median(_FAR).mean())
+    if len(rows) >= _FEWEST_ROWS:
+        doubts = replace(doubts, far=look_at(rows, predictor_at(weighed, fit.values)).far_from_median(_FAR).mean())
     return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
 
 
@@ -149,8 +152,13 @@ def _first_doubts(model: Model) -> RowDoubts:
     """Noise scales from short fits to some rows. The median of their errors gives the variance."""
     # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
     # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
+    #
+    # Rows that are far off together, next to each other, may be a bump of the function. They are no outliers until a
+    # fit to all of them has not learned it.
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
-    doubts, values = _doubts_of_medians(model), None
+    raw = rows.some(np.arange(len(rows)))
+    neighbours = Neighbours.of(raw.inputs)
+    doubts, values = _doubts_of_medians(model, raw, neighbours), None
     chosen = np.arange(len(rows))
     if size < len(rows):
         chosen = np.sort(model.rng.choice(len(rows), size, replace=False))
@@ -163,9 +171,10 @@ def _first_doubts(model: Model) -> RowDoubts:
         if turn == 0:
             # The pulled fit shifts the errors of all other rows.
             far = look.far_from_median(_FAR_FROM_MEDIAN)
+            far &= ~neighbours.together(far)
             seen = _without(doubts.weigh(rows), far & (far.mean() <= _FEW))
         else:
-            before, doubts = doubts, _first_of(look, doubts.scales)
+            before, doubts = doubts, _first_of(look, doubts.scales, neighbours)
             seen = doubts.without_outliers(doubts.weigh(rows))
             if doubts.rejects_as(before):
                 break
@@ -173,11 +182,10 @@ def _first_doubts(model: Model) -> RowDoubts:
     return doubts
 
 
-def _doubts_of_medians(model: Model) -> RowDoubts:
-    """Noise scales from the errors of the medians of neighbours."""
-    raw = model.rows.some(np.arange(len(model.rows)))
+def _doubts_of_medians(model: Model, raw: RawRows, neighbours: Neighbours) -> RowDoubts:
+    """Noise scales of a model's rows from the errors of the medians of neighbours."""
     n, o = raw.targets.shape
-    errors = errors_of_medians(raw.inputs.reshape(n, -1), raw.targets)
+    errors = neighbours.errors(raw.targets)
     counts = variance = np.ones(n)
     if raw.counts is not None and raw.precision is not None:
         counts, variance = raw.counts, raw.counts / raw.precision
@@ -185,16 +193,19 @@ def _doubts_of_medians(model: Model) -> RowDoubts:
     typical = ordinary_variance(np.sqrt(look.squares))
     # Targets of which most are equal have no scale.
     typical = np.where(typical > 0.0, typical, np.inf)
-    return _first_of(look, model.problem.noise.row_scales(o, np.zeros(n)), typical)
+    return _first_of(look, model.problem.noise.row_scales(o, np.zeros(n)), neighbours, typical)
 
 
-def _first_of(look: Look, scales: RowScales, typical: np.ndarray | None = None) -> RowDoubts:
+def _first_of(look: Look, scales: RowScales, neighbours: Neighbours, typical: np.ndarray | None = None) -> RowDoubts:
     """Noise scales from errors with a typical variance (o,), or 1 for all rows if too many seem to be outliers."""
     typical = look.typical if typical is None else typical
-    doubts = RowDoubts(scales, np.ones(len(typical))).seen_in(look, typical, np.zeros(len(typical), dtype=bool))
-    if np.mean((doubts.scales.outlier > 0.5) | look.beyond(typical)) <= _FEW:
-        return doubts
-    return RowDoubts(scales.at(np.zeros(len(look.errors))), np.ones(len(typical)))
+    distances = look.distances(typical)
+    far = (scales.at(distances).outlier > 0.5) | look.beyond(typical)
+    together = neighbours.together(far)
+    far &= ~together
+    if far.mean() > _FEW:
+        return RowDoubts(scales.at(np.zeros(len(far))), np.ones(len(typical)))
+    return RowDoubts(scales.at(np.where(together, 0.0, distances)), np.ones(len(typical)), far if far.any() else None)
 
 
 def _without(rows: Rows, outlier: np.ndarray) -> Rows:
