@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from ..data.rows import LocalSource, RawRows, Rows
 from ..model.model import SparseModel
@@ -42,6 +43,10 @@ _PATIENCE = 3.0
 _FAR = 6.0
 # In the first short fit, which outliers may pull, rows count as outliers from so many standard deviations.
 _FAR_FROM_MEDIAN = 3.0
+# Outliers follow a Student-t with so many degrees of freedom, that is so many times as wide as the noise.
+_OUTLIER_DEGREES, _OUTLIER_WIDTH = 4.0, 30.0
+# Of 15 % of outliers at random places, 3 % are next to each other. A larger share than this is no chance.
+_TOGETHER = 0.2
 # Fewer rows than this do not show which share of them is far off.
 _FEWEST_ROWS = 20
 # Number of rows that are predicted at once.
@@ -149,37 +154,67 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
 
 
 def _first_doubts(model: Model) -> RowDoubts:
-    """Noise scales from short fits to some rows. The median of their errors gives the variance."""
-    # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
-    # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
-    #
-    # Rows that are far off together, next to each other, may be a bump of the function. They are no outliers until a
-    # fit to all of them has not learned it.
+    """Noise scales from short fits to some rows: with outliers from medians, or without any, whichever is likelier."""
+    # Medians of neighbours are also wrong where a function is steep, or where few rows see it. So a fit to all rows,
+    # whose outliers are those that it shows by itself, is tried too. It is kept if the outliers of the medians are next
+    # to each other, as the rows of a bump are.
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
-    raw = rows.some(np.arange(len(rows)))
-    neighbours = Neighbours.of(raw.inputs)
-    doubts, values = _doubts_of_medians(model, raw, neighbours), None
     chosen = np.arange(len(rows))
     if size < len(rows):
         chosen = np.sort(model.rng.choice(len(rows), size, replace=False))
     short = replace(model, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
+    raw = rows.some(np.arange(len(rows)))
+    neighbours = Neighbours.of(raw.inputs)
+    robust, from_robust = _robust_doubts(short, rows, chosen, _doubts_of_medians(short, raw, neighbours))
+    if robust.rejected is None:
+        return robust
+    fit = search(replace(short, rows=rows.subset(chosen)))
+    look = look_at(rows, predictor_at(short, fit.values))
+    plain = _first_of(look, robust.scales)
+    if neighbours.together(robust.rejected) > _TOGETHER:
+        return plain
+    scores = [
+        _evidence(short, rows, chosen, doubts, values)
+        for doubts, values in ((robust, from_robust), (plain, fit.values))
+    ]
+    return robust if scores[0] > scores[1] else plain
+
+
+def _evidence(model: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts, values: Values) -> float:
+    """The bound of the rows that are not rejected, plus the log density of the others as outliers, in nats."""
+    rejected = np.zeros(len(chosen), dtype=bool) if doubts.rejected is None else doubts.rejected[chosen]
+    seen = rows.subset(chosen)
+    fit = replace(model, rows=_without(seen, rejected)).minimise(Start(values, model.max_iter))
+    if not rejected.any():
+        return fit.bound
+    look = look_at(seen, predictor_at(model, fit.values))
+    share, scale = rejected.mean(), _OUTLIER_WIDTH * np.sqrt(fit.values["noise"])
+    wide = student_t.logpdf(np.sqrt(look.squares[rejected]) / scale, _OUTLIER_DEGREES) - np.log(scale)
+    n_others = len(chosen) - rejected.sum()
+    return float(fit.bound + n_others * np.log1p(-share) + rejected.sum() * np.log(share) + wide.sum())
+
+
+def _robust_doubts(short: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts) -> tuple[RowDoubts, Values]:
+    """Noise scales that begin with those of the medians of neighbours, and the values of the last short fit."""
+    # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
+    # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
     seen = doubts.without_outliers(doubts.weigh(rows))
+    values: Values | None = None
     for turn in range(_LOOKS):
-        short = replace(short, rows=seen.subset(chosen))
-        fit = search(short) if values is None else short.minimise(Start(values, short.max_iter))
-        look = look_at(rows, predictor_at(short, fit.values))
+        own = replace(short, rows=seen.subset(chosen))
+        fit = search(own) if values is None else own.minimise(Start(values, short.max_iter))
+        look, values = look_at(rows, predictor_at(own, fit.values)), fit.values
         if turn == 0:
             # The pulled fit shifts the errors of all other rows.
             far = look.far_from_median(_FAR_FROM_MEDIAN)
-            far &= ~neighbours.together(far)
             seen = _without(doubts.weigh(rows), far & (far.mean() <= _FEW))
         else:
-            before, doubts = doubts, _first_of(look, doubts.scales, neighbours)
+            before, doubts = doubts, _first_of(look, doubts.scales)
             seen = doubts.without_outliers(doubts.weigh(rows))
             if doubts.rejects_as(before):
                 break
-        values = fit.values
-    return doubts
+    assert values is not None
+    return doubts, values
 
 
 def _doubts_of_medians(model: Model, raw: RawRows, neighbours: Neighbours) -> RowDoubts:
@@ -193,19 +228,17 @@ def _doubts_of_medians(model: Model, raw: RawRows, neighbours: Neighbours) -> Ro
     typical = ordinary_variance(np.sqrt(look.squares))
     # Targets of which most are equal have no scale.
     typical = np.where(typical > 0.0, typical, np.inf)
-    return _first_of(look, model.problem.noise.row_scales(o, np.zeros(n)), neighbours, typical)
+    return _first_of(look, model.problem.noise.row_scales(o, np.zeros(n)), typical)
 
 
-def _first_of(look: Look, scales: RowScales, neighbours: Neighbours, typical: np.ndarray | None = None) -> RowDoubts:
+def _first_of(look: Look, scales: RowScales, typical: np.ndarray | None = None) -> RowDoubts:
     """Noise scales from errors with a typical variance (o,), or 1 for all rows if too many seem to be outliers."""
     typical = look.typical if typical is None else typical
     distances = look.distances(typical)
     far = (scales.at(distances).outlier > 0.5) | look.beyond(typical)
-    together = neighbours.together(far)
-    far &= ~together
     if far.mean() > _FEW:
         return RowDoubts(scales.at(np.zeros(len(far))), np.ones(len(typical)))
-    return RowDoubts(scales.at(np.where(together, 0.0, distances)), np.ones(len(typical)), far if far.any() else None)
+    return RowDoubts(scales.at(distances), np.ones(len(typical)), far if far.any() else None)
 
 
 def _without(rows: Rows, outlier: np.ndarray) -> Rows:

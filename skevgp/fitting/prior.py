@@ -20,8 +20,8 @@ from ..utils.validation import as_floats, check_magnitude
 # The scale of a weight without prior knowledge is so many times the largest that least squares could give. The prior
 # then changes predictions by 1e-6 of their std.
 _WIDE = 1e3
-# With fewer rows than twice the weights, it is so many times y over the rms of a feature: std would be as wide as the
-# prior. Scales that are learned start there too.
+# With few rows, it is so many times the rms of y over that of a feature: std would be as wide as the prior. Scales that
+# are learned start there too.
 _MODERATE = 10.0
 # Smallest share of a feature that other features do not represent. A still smaller one than the second is rounding.
 _INDEPENDENT, _COLLINEAR = 1e-6, 1e-12
@@ -42,7 +42,7 @@ class CoefPrior(StatefulEstimator):
     scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
         Prior standard deviation. If ``"auto"``, that of the feature map. If the map has no prior, 1000 times the
         largest weight that least squares could give, so that the prior has no effect on predictions. With fewer rows
-        than twice the features, it is 10 * rms(y) / rms(h). A scale of 0 keeps a weight at its mean. `EGPRegressor`
+        than ten times the features, it is 10 * rms(y) / rms(h). A scale of 0 keeps a weight at its mean. `EGPRegressor`
         also takes ``np.inf``, which gives generalised least squares.
     cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
         Prior covariance Σ, of all outputs or of each, instead of ``scale``. For example, the mass and the first moment

@@ -29,6 +29,8 @@ from .units import LeftOver, Units, triangles_of_features
 
 # An infinite prior scale becomes this many times the scale of weights without prior knowledge.
 _VAGUE = 10.0
+# Weights are free with so many rows each. With fewer, a prior of moderate width makes predictions more accurate.
+_ENOUGH = 10
 # A feature that is smaller than this share of the largest one counts as 0.
 _NEGLIGIBLE = 1e-80
 # Largest prior standard deviation of the features' contribution, in units of the residuals. Its square over the lowest
@@ -214,7 +216,7 @@ def _prior(
         found = np.sqrt(squares / targets.n)
         return np.where(found > 0.0, found, np.where(targets.largest > 0.0, targets.largest, 1.0))
 
-    few = data.source.n_rows * (o if shared else 1) < 2 * features.mean.shape[-1]
+    few = data.source.n_rows * (o if shared else 1) < _ENOUGH * features.mean.shape[-1]
 
     @cache
     def wide(learned: bool) -> np.ndarray:

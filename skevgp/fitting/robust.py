@@ -12,7 +12,7 @@ from ..data.rows import LocalSource
 
 # The prediction of a row is the median of so many neighbours among so many rows, evenly spaced.
 _NEIGHBOURS, _SAMPLE = 15, 5000
-# Rows that are outliers by chance have fewer outliers than others among so many of their nearest neighbours.
+# Outliers are seldom most of so many nearest neighbours of an outlier.
 _CLOSE = 5
 # Share of the rows that set the scale of errors: a larger one would include outliers.
 _ORDINARY = 0.7
@@ -52,10 +52,10 @@ class Neighbours:
             return np.zeros(targets.shape)
         return np.asarray(targets - np.median(targets[self.indices], axis=1))
 
-    def together(self, chosen: np.ndarray) -> np.ndarray:
-        """Which of the chosen rows (n,) have mostly chosen rows around them, as a bump of a function has."""
-        close = chosen[self.indices[:, :_CLOSE]]
-        return np.asarray(chosen & (2 * close.sum(axis=1) > close.shape[1]))
+    def together(self, chosen: np.ndarray) -> float:
+        """Share of the chosen rows (n,) that have mostly chosen rows around them, as a bump of a function has."""
+        close = chosen[self.indices[chosen, :_CLOSE]]
+        return float(np.mean(2 * close.sum(axis=1) > close.shape[1])) if chosen.any() else 0.0
 
 
 def ordinary_variance(errors: np.ndarray) -> np.ndarray:

@@ -154,7 +154,7 @@ class TorqueRegression(StatefulEstimator):
         else:
             triangles = np.linalg.qr(features.transpose(1, 0, 2)).R
             scale = wide_scale(
-                triangles, len(y), np.abs(y).max(axis=0), shared=True, moderate=y.size < 2 * features.shape[-1]
+                triangles, len(y), np.abs(y).max(axis=0), shared=True, moderate=y.size < 10 * features.shape[-1]
             )[0]
             mean, covariance = np.zeros(len(scale)), np.diag(scale**2)
         coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
