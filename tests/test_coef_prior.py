@@ -6,6 +6,7 @@ from sklearn.compose import make_column_transformer
 from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
+from skevgp import EVGPRegressor
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.fitting.prior import CoefPrior, InData, resolved, wide_scale
 
@@ -54,15 +55,15 @@ def in_data(features, targets=TARGETS):
         return rms(targets - features @ mean.T)
 
     shape = targets.shape[1], features.shape[1]
-    return InData(shape, lambda: wide(features, targets), rms(features), left_over)
+    return InData(shape, lambda learned: wide(features, targets, moderate=learned), rms(features), left_over)
 
 
 def rms(values):
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def wide(features, targets=TARGETS):
-    return wide_scale(np.linalg.qr(features).R[np.newaxis], len(features), np.abs(targets).max(axis=0))
+def wide(features, targets=TARGETS, **options):
+    return wide_scale(np.linalg.qr(features).R[np.newaxis], len(features), np.abs(targets).max(axis=0), **options)
 
 
 def scale_of(feature_map, features, left_over):
@@ -100,6 +101,12 @@ def test_map_without_an_opinion_gets_a_wide_prior():
 def test_wide_scale_is_that_of_a_feature_alone_for_copies_and_zeros():
     H = np.array([[1.0, 1.0, 0.0]] * 4 + [[-2.0, -2.0, 0.0]] * 4)
     assert_allclose(wide(H, np.full((8, 1), 3.0)), [3e3 * np.array([1.0, 1.0, np.sqrt(2.5)]) / np.sqrt(2.5)])
+
+
+def test_scale_for_few_rows_is_ten_times_what_would_explain_the_target():
+    model = EVGPRegressor(PolynomialFeatures(2), random_state=0).fit(X[:15], TARGETS[:15, 0])
+    H = PolynomialFeatures(2).fit_transform(X[:15])
+    assert_allclose(model.coef_prior_scale_, 10.0 * rms(TARGETS[:15, 0]) / rms(H))
 
 
 def test_shared_wide_scale_follows_the_output_that_needs_the_widest():

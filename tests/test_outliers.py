@@ -185,3 +185,14 @@ def test_far_outliers_do_not_move_a_noise_model_without_outliers():
     model.fit(FIELD_X, y)
     assert model.noise_variance_ == pytest.approx(noise, rel=0.2)
     assert np.corrcoef(model.predict(FIELD_X), FIELD)[0, 1] > 0.995
+
+
+def test_bump_of_the_function_is_no_outlier():
+    """Thirty standard deviations high, with 5 % of the rows."""
+    rng = np.random.default_rng(0)
+    x = np.sort(rng.uniform(-3.0, 3.0, 300))[:, np.newaxis]
+    bump = 3.0 * np.exp(-0.5 * ((x[:, 0] - 0.5) / 0.15) ** 2)
+    y = np.sin(x[:, 0]) + bump + 0.1 * rng.standard_normal(300)
+    model = EVGPRegressor(n_inducing=40, noise="student-t", random_state=0).fit(x, y)
+    assert (model.weights_ > 0.5).all()
+    assert np.abs(model.predict(x) - np.sin(x[:, 0]) - bump).max() < 0.5

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import t as student_t
 
-from ..data.rows import LocalSource, Rows
+from ..data.rows import LocalSource, RawRows, Rows
 from ..model.model import SparseModel
 from ..model.parameters import Values
 from ..model.predictor import Predictor
 from ..noise.base import RowScales
 from .model import ENOUGH, LEAST_TOL, Model
-from .robust import errors_of_medians, ordinary_variance
+from .robust import Neighbours, ordinary_variance
 from .search import Fit, Start, better, search
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ _LOOK_ITERATIONS, _LOOK_ROWS, _LOOK_ROWS_PER_POINT = 30, 2000, 10
 # The median of the square of a standard normal number.
 _MEDIAN_SQUARE = 0.4549
 # If more than this share of the rows seem to be outliers, the first scales are all 1.
-_FEW = 0.3
+_FEW = 0.2
 # Share of the iterations before scales are estimated again, and then the number of iterations between estimates.
 _BEFORE, _BETWEEN = 2.0 / 3.0, 50
 # Scales and q alternate until no E[τ] changes by more than this share, or so many times.
@@ -42,6 +43,12 @@ _PATIENCE = 3.0
 _FAR = 6.0
 # In the first short fit, which outliers may pull, rows count as outliers from so many standard deviations.
 _FAR_FROM_MEDIAN = 3.0
+# Outliers follow a Student-t with so many degrees of freedom, that is so many times as wide as the noise.
+_OUTLIER_DEGREES, _OUTLIER_WIDTH = 4.0, 30.0
+# Of 15 % of outliers at random places, 3 % are next to each other. A larger share than this is no chance.
+_TOGETHER = 0.2
+# Fewer rows than this do not show which share of them is far off.
+_FEWEST_ROWS = 20
 # Number of rows that are predicted at once.
 _ROWS_AT_ONCE = 4096
 
@@ -141,25 +148,62 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
                 fit = replace(fit, converged=True, message="")
     # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
     weighed = replace(weighed, rows=doubts.weigh(rows))
-    doubts = replace(doubts, far=look_at(rows, predictor_at(weighed, fit.values)).far_from_median(_FAR).mean())
+    if len(rows) >= _FEWEST_ROWS:
+        doubts = replace(doubts, far=look_at(rows, predictor_at(weighed, fit.values)).far_from_median(_FAR).mean())
     return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
 
 
 def _first_doubts(model: Model) -> RowDoubts:
-    """Noise scales from short fits to some rows. The median of their errors gives the variance."""
-    # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
-    # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
+    """Noise scales from short fits to some rows: with outliers from medians, or without any, whichever is likelier."""
+    # Medians of neighbours are also wrong where a function is steep, or where few rows see it. So a fit to all rows,
+    # whose outliers are those that it shows by itself, is tried too. It is kept if the outliers of the medians are next
+    # to each other, as the rows of a bump are.
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
-    doubts, values = _doubts_of_medians(model), None
     chosen = np.arange(len(rows))
     if size < len(rows):
         chosen = np.sort(model.rng.choice(len(rows), size, replace=False))
     short = replace(model, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
+    raw = rows.some(np.arange(len(rows)))
+    neighbours = Neighbours.of(raw.inputs)
+    robust, from_robust = _robust_doubts(short, rows, chosen, _doubts_of_medians(short, raw, neighbours))
+    if robust.rejected is None:
+        return robust
+    fit = search(replace(short, rows=rows.subset(chosen)))
+    look = look_at(rows, predictor_at(short, fit.values))
+    plain = _first_of(look, robust.scales)
+    if neighbours.together(robust.rejected) > _TOGETHER:
+        return plain
+    scores = [
+        _evidence(short, rows, chosen, doubts, values)
+        for doubts, values in ((robust, from_robust), (plain, fit.values))
+    ]
+    return robust if scores[0] > scores[1] else plain
+
+
+def _evidence(model: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts, values: Values) -> float:
+    """The bound of the rows that are not rejected, plus the log density of the others as outliers, in nats."""
+    rejected = np.zeros(len(chosen), dtype=bool) if doubts.rejected is None else doubts.rejected[chosen]
+    seen = rows.subset(chosen)
+    fit = replace(model, rows=_without(seen, rejected)).minimise(Start(values, model.max_iter))
+    if not rejected.any():
+        return fit.bound
+    look = look_at(seen, predictor_at(model, fit.values))
+    share, scale = rejected.mean(), _OUTLIER_WIDTH * np.sqrt(fit.values["noise"])
+    wide = student_t.logpdf(np.sqrt(look.squares[rejected]) / scale, _OUTLIER_DEGREES) - np.log(scale)
+    n_others = len(chosen) - rejected.sum()
+    return float(fit.bound + n_others * np.log1p(-share) + rejected.sum() * np.log(share) + wide.sum())
+
+
+def _robust_doubts(short: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts) -> tuple[RowDoubts, Values]:
+    """Noise scales that begin with those of the medians of neighbours, and the values of the last short fit."""
+    # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
+    # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
     seen = doubts.without_outliers(doubts.weigh(rows))
+    values: Values | None = None
     for turn in range(_LOOKS):
-        short = replace(short, rows=seen.subset(chosen))
-        fit = search(short) if values is None else short.minimise(Start(values, short.max_iter))
-        look = look_at(rows, predictor_at(short, fit.values))
+        own = replace(short, rows=seen.subset(chosen))
+        fit = search(own) if values is None else own.minimise(Start(values, short.max_iter))
+        look, values = look_at(rows, predictor_at(own, fit.values)), fit.values
         if turn == 0:
             # The pulled fit shifts the errors of all other rows.
             far = look.far_from_median(_FAR_FROM_MEDIAN)
@@ -169,15 +213,14 @@ def _first_doubts(model: Model) -> RowDoubts:
             seen = doubts.without_outliers(doubts.weigh(rows))
             if doubts.rejects_as(before):
                 break
-        values = fit.values
-    return doubts
+    assert values is not None
+    return doubts, values
 
 
-def _doubts_of_medians(model: Model) -> RowDoubts:
-    """Noise scales from the errors of the medians of neighbours."""
-    raw = model.rows.some(np.arange(len(model.rows)))
+def _doubts_of_medians(model: Model, raw: RawRows, neighbours: Neighbours) -> RowDoubts:
+    """Noise scales of a model's rows from the errors of the medians of neighbours."""
     n, o = raw.targets.shape
-    errors = errors_of_medians(raw.inputs.reshape(n, -1), raw.targets)
+    errors = neighbours.errors(raw.targets)
     counts = variance = np.ones(n)
     if raw.counts is not None and raw.precision is not None:
         counts, variance = raw.counts, raw.counts / raw.precision
@@ -191,10 +234,11 @@ def _doubts_of_medians(model: Model) -> RowDoubts:
 def _first_of(look: Look, scales: RowScales, typical: np.ndarray | None = None) -> RowDoubts:
     """Noise scales from errors with a typical variance (o,), or 1 for all rows if too many seem to be outliers."""
     typical = look.typical if typical is None else typical
-    doubts = RowDoubts(scales, np.ones(len(typical))).seen_in(look, typical, np.zeros(len(typical), dtype=bool))
-    if np.mean((doubts.scales.outlier > 0.5) | look.beyond(typical)) <= _FEW:
-        return doubts
-    return RowDoubts(scales.at(np.zeros(len(look.errors))), np.ones(len(typical)))
+    distances = look.distances(typical)
+    far = (scales.at(distances).outlier > 0.5) | look.beyond(typical)
+    if far.mean() > _FEW:
+        return RowDoubts(scales.at(np.zeros(len(far))), np.ones(len(typical)))
+    return RowDoubts(scales.at(distances), np.ones(len(typical)), far if far.any() else None)
 
 
 def _without(rows: Rows, outlier: np.ndarray) -> Rows:

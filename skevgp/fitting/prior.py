@@ -18,8 +18,11 @@ from ..utils.state import StatefulEstimator
 from ..utils.validation import as_floats, check_magnitude
 
 # The scale of a weight without prior knowledge is so many times the largest that least squares could give. The prior
-# then changes predictions by 1e-6 of their std. If the scale is learned, it starts at this share of that.
-_WIDE, _START_OF_LEARNED = 1e3, 1e-2
+# then changes predictions by 1e-6 of their std.
+_WIDE = 1e3
+# With few rows, it is so many times the rms of y over that of a feature: std would be as wide as the prior. Scales that
+# are learned start there too.
+_MODERATE = 10.0
 # Smallest share of a feature that other features do not represent. A still smaller one than the second is rounding.
 _INDEPENDENT, _COLLINEAR = 1e-6, 1e-12
 # Rounding errors of correlations.
@@ -38,8 +41,9 @@ class CoefPrior(StatefulEstimator):
         no such method.
     scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
         Prior standard deviation. If ``"auto"``, that of the feature map. If the map has no prior, 1000 times the
-        largest weight that least squares could give, so that the prior has no effect on predictions. A scale of 0 keeps
-        a weight at its mean. `EGPRegressor` also takes ``np.inf``, which gives generalised least squares.
+        largest weight that least squares could give, so that the prior has no effect on predictions. With fewer rows
+        than ten times the features, it is 10 * rms(y) / rms(h). A scale of 0 keeps a weight at its mean. `EGPRegressor`
+        also takes ``np.inf``, which gives generalised least squares.
     cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
         Prior covariance Σ, of all outputs or of each, instead of ``scale``. For example, the mass and the first moment
         of a link are correlated.
@@ -130,8 +134,8 @@ class InData:
 
     # k and p.
     shape: tuple[int, int]
-    # Returns the scale (k, p) of weights without prior knowledge, from `wide_scale`.
-    wide: Callable[[], np.ndarray]
+    # Returns the scale (k, p) of weights without prior knowledge, or its start if it is learned, from `wide_scale`.
+    wide: Callable[[bool], np.ndarray]
     # (p,) or (o, p): the rms of each feature.
     size: np.ndarray
     # Maps a prior mean (k, p) to the rms (o,) of what it leaves of y.
@@ -188,13 +192,14 @@ def resolved(
     else:
         scale = _in_units_of_data(scale, mean, parts, data)
         unknown = np.isnan(scale)
-        scale = np.where(unknown, data.wide(), scale) if unknown.any() else scale
+        scale = np.where(unknown, data.wide(False), scale) if unknown.any() else scale
     _check_finite(np.where(scale == np.inf, 1.0, scale) if allow_vague else scale, scale_name)
     if (scale < 0).any():
         raise ValueError(f"scale of CoefPrior must not be negative; its smallest value is {scale.min()}.")
     groups = _groups(prior, parts, n_outputs, shape, by_hand)
     groups[(scale == 0.0) | np.isinf(scale)] = ""
-    scale = np.where(unknown & (groups != ""), _START_OF_LEARNED * scale, scale)
+    if (learned := unknown & (groups != "")).any():
+        scale = np.where(learned, data.wide(True), scale)
     mean, scale = mean.astype(float), scale.astype(float)
     if (correlation == _independent(shape)).all():
         return Resolved(mean, scale, None, groups)
@@ -343,11 +348,14 @@ def _shapes_text(shape: tuple[int, int], shared: bool) -> str:
     return f"the shape (n_outputs, n_features_out) = {shape}{alone}"
 
 
-def wide_scale(triangles: np.ndarray, n_rows: float, target_size: np.ndarray, shared: bool = False) -> np.ndarray:
+def wide_scale(
+    triangles: np.ndarray, n_rows: float, target_size: np.ndarray, shared: bool = False, moderate: bool = False
+) -> np.ndarray:
     """The scale of weights without prior knowledge: (o, p), or (1, p) if they are shared.
 
-    ``triangles`` (k, r, p) are R with HᵀΩH = RᵀR, one for all outputs or o. ``n_rows`` is Σω, and ``target_size`` (o,)
-    the largest absolute value of each target. For shared weights the widest scale of all outputs counts.
+    ``triangles`` (k, r, p) are R with HᵀΩH = RᵀR, one for all outputs or o, and ``n_rows`` is Σω. ``target_size`` (o,)
+    is the largest absolute value of each target, or its rms for a ``moderate`` scale: for few rows, and for the start
+    of scales that are learned. For shared weights the widest scale of all outputs counts.
     """
     # With |y| ≤ a on all rows, least squares gives no weight above a √(Σω (HᵀΩH)⁻¹_jj) (by Cauchy-Schwarz). That is
     # a / rms of the part of h_j that the other features cannot represent. For powers of a column far from 0, it is far
@@ -359,6 +367,9 @@ def wide_scale(triangles: np.ndarray, n_rows: float, target_size: np.ndarray, sh
     alone = size[:, np.newaxis] / np.where((rms := _sizes(each) / np.sqrt(n_rows)) > 0.0, rms, np.inf)
     if shared:
         alone = alone.max(axis=0, keepdims=True)
+    if moderate:
+        return _MODERATE * np.where(alone > 0.0, alone, of_zeros)
+    if shared:
         # The rows of all outputs, in units of their targets.
         each = np.linalg.qr((each / size[:, np.newaxis, np.newaxis]).reshape(-1, p)).R[np.newaxis]
         n_rows, size = n_rows * o, np.ones(1)

@@ -29,6 +29,8 @@ from .units import LeftOver, Units, triangles_of_features
 
 # An infinite prior scale becomes this many times the scale of weights without prior knowledge.
 _VAGUE = 10.0
+# Weights are free with so many rows each. With fewer, a prior of moderate width makes predictions more accurate.
+_ENOUGH = 10
 # A feature that is smaller than this share of the largest one counts as 0.
 _NEGLIGIBLE = 1e-80
 # Largest prior standard deviation of the features' contribution, in units of the residuals. Its square over the lowest
@@ -214,11 +216,17 @@ def _prior(
         found = np.sqrt(squares / targets.n)
         return np.where(found > 0.0, found, np.where(targets.largest > 0.0, targets.largest, 1.0))
 
+    few = data.source.n_rows * (o if shared else 1) < _ENOUGH * features.mean.shape[-1]
+
     @cache
-    def wide() -> np.ndarray:
+    def wide(learned: bool) -> np.ndarray:
         R, total_precision = triangles_of_features(data.source)
-        largest = np.maximum(np.abs(targets.lowest - target_mean), np.abs(targets.highest - target_mean))
-        return wide_scale(R * counts.reshape(-1, 1, counts.shape[-1]), total_precision, largest, shared)
+        R = R * counts.reshape(-1, 1, counts.shape[-1])
+        if moderate := learned or few:
+            y = np.sqrt(targets.variance + (targets.mean - target_mean) ** 2)
+        else:
+            y = np.maximum(np.abs(targets.lowest - target_mean), np.abs(targets.highest - target_mean))
+        return wide_scale(R, total_precision, y, shared, moderate)
 
     shape = 1 if shared else o, features.mean.shape[-1]
     found = resolved(asked, feature_map, data.given, InData(shape, wide, size, left_over), o, allow_vague)
@@ -228,7 +236,7 @@ def _prior(
         root = None if root is None else np.repeat(root, o, axis=0)
     vague = np.isinf(scale)
     # An infinite scale becomes one so wide that its value does not matter.
-    scale = np.where(vague, _VAGUE * wide(), scale) if vague.any() else scale
+    scale = np.where(vague, _VAGUE * wide(False), scale) if vague.any() else scale
     labels = tuple(dict.fromkeys(label for label in groups.ravel() if label))
     numbers = None
     if labels:

@@ -153,7 +153,9 @@ class TorqueRegression(StatefulEstimator):
             mean, covariance = self.feature_map_.coef_prior(n_outputs)
         else:
             triangles = np.linalg.qr(features.transpose(1, 0, 2)).R
-            scale = wide_scale(triangles, len(y), np.abs(y).max(axis=0), shared=True)[0]
+            scale = wide_scale(
+                triangles, len(y), np.abs(y).max(axis=0), shared=True, moderate=y.size < 10 * features.shape[-1]
+            )[0]
             mean, covariance = np.zeros(len(scale)), np.diag(scale**2)
         coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
         inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)

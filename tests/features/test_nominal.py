@@ -58,7 +58,7 @@ def mean_of(features, X, n_outputs):
     """The prior mean of the weights. It does not depend on the data."""
     width = features.transform(X).shape[1]
     data = InData(
-        (n_outputs, width), lambda: np.ones((n_outputs, width)), np.ones(width), lambda mean: np.ones(n_outputs)
+        (n_outputs, width), lambda learned: np.ones((n_outputs, width)), np.ones(width), lambda mean: np.ones(n_outputs)
     )
     return resolved(CoefPrior(), features, X, data, n_outputs).mean
 

@@ -68,7 +68,7 @@ def test_what_features_represent_changes_neither_errors_nor_std(model, y):
 def test_what_features_represent_is_added_to_predictions(seed, feature_map, size, far, exact):
     """For a given kernel and noise, up to rounding and 1e-6 of std. Columns may be far from 0."""
     rng = np.random.default_rng(seed)
-    rows, new = rng.normal(size=(20, 2)) + far, rng.normal(size=(5, 2)) + far
+    rows, new = rng.normal(size=(80, 2)) + far, rng.normal(size=(5, 2)) + far
     kernel = ConstantKernel(2.0, "fixed") * RBF(1.5, "fixed") + WhiteKernel(0.1, "fixed")
     model = (
         EGPRegressor(feature_map, kernel)
@@ -80,7 +80,7 @@ def test_what_features_represent_is_added_to_predictions(seed, feature_map, size
     singular = np.linalg.svd(H / unit, compute_uv=False)
     # Sums of products keep the digits of such features.
     assume(singular[-1] > 1e-4 * singular[0])
-    y = np.sin(rows[:, 0]) + 0.1 * rng.normal(size=20)
+    y = np.sin(rows[:, 0]) + 0.1 * rng.normal(size=80)
     b = size * rng.normal(size=H.shape[1]) / unit
     mean, std = predictions_without(model, rows, y, 0.0, new, 0.0)
     offset_of_new = clone(feature_map).fit(rows).transform(new) @ b

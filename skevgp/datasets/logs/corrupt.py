@@ -7,7 +7,8 @@ a reversal and noise stay: a value must also be impossible. There are three reas
 * It is farther from its neighbours than all other values from each other.
 * It is exactly 0, as a value that a driver does not fill, and farther from its neighbours than steps elsewhere.
 
-An effort or an acceleration stays if the velocity leaps at the same time: it may be an impact.
+An effort or an acceleration stays if the velocity leaps at the same time: it may be an impact. It also stays if
+three or more last for more than one row: they are pulses.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ _LONGEST = {"velocity": 20, "acceleration": 3, "torque": 3}  # rows of a spike; 
 _FARTHER = 1.5  # times the range of all other values
 _LARGE = 0.25  # ... if the position contradicts a velocity: brakes shake it for one row
 _FASTER = 4.0  # times the largest step elsewhere
+_PULSES = 3  # spikes of an effort that last for more than one row: corrupt values are seldom next to each other
 _AGREES = 0.25  # of the spike's integral: the change of position is so near to that without the spike
 _USUAL = 4.0  # a spike's integral is so many times the usual deviation between velocity and position
 _QUANTILE = 0.99  # of all deviations, which is the usual one
@@ -55,6 +57,8 @@ def find_corrupt(raw: Signals, step: float, gap: float, breaks: Sequence[Break])
             impossible = spikes.impossible(position if signal == "velocity" else None)
             if signal == "velocity":
                 leaps = of_joint.leaps()
+            if signal != "velocity" and spikes.are_pulses(impossible):
+                continue
             for k in impossible.tolist():
                 before, after = spikes.rows[k]
                 if signal == "velocity":
@@ -75,6 +79,10 @@ class _Spikes:
     rows: list[tuple[int, int]]  # before and after each spike
     lines: list[np.ndarray]  # of each spike: the values of a line between its neighbours
     worst: list[int]  # the row of each spike that is farthest from the line
+
+    def are_pulses(self, chosen: np.ndarray) -> bool:
+        """Whether spikes, given by their indices, recur as pulses do."""
+        return sum(after - before > 2 for before, after in (self.rows[k] for k in chosen.tolist())) >= _PULSES
 
     @classmethod
     def of(cls, time: np.ndarray, values: np.ndarray, steps: Steps, longest: int) -> _Spikes:

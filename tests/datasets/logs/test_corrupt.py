@@ -90,6 +90,8 @@ def genuine(name):
         table[:, EFFORT] = 5.0 * (-1.0) ** np.arange(len(t))
     elif name == "one pulse of the effort":
         table[:, EFFORT] = np.where((t > 7.0) & (t < 7.1), 50.0, table[:, EFFORT])
+    elif name == "short pulses of the effort":
+        table[:, EFFORT] += np.where(np.arange(len(t)) % 97 < 2, 50.0, 0.0)
     elif name == "noise with outliers":
         table[:, EFFORT] += rng.standard_t(4, len(t))
         table[:, VELOCITY] += 0.2 * rng.standard_t(4, len(t))
@@ -111,6 +113,7 @@ def genuine(name):
         "one step of the effort",
         "effort of two levels",
         "one pulse of the effort",
+        "short pulses of the effort",
         "noise with outliers",
         "differences of coarse positions",
         "impacts",
