@@ -10,7 +10,7 @@ import numpy as np
 from skevgp.data.blocks import LocalBlocks
 from skevgp.data.dataset import Dataset
 from skevgp.data.rows import LocalSource, Moments, RawRows, Rows, block_of
-from skevgp.fitting.search import Rules
+from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential

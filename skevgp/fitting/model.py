@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain, pairwise, starmap
 from operator import index
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,22 +15,21 @@ from ..data.blocks import Blocks
 from ..data.rows import Rows, of_outputs
 from ..data.threads import BlockMap
 from ..model.bounds import bounds_alone
-from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.exact import ExactModel, LikelihoodObjective, exact_twin
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
+from .fitted import Fitted
 from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
 from .messages import ended_early, learned_too_little, mini_batches_ended
 from .problem import Problem, Sharing
-from .search import FeaturesAlone, Fit, Rules, Start, drawn
+from .rules import Rules
+from .search import FeaturesAlone, Fit, Start, drawn
 from .start import LOWEST_NOISE, centred_kernels, checked_variance, starting_table
 from .units import may_hide_noise, noise_of_most_evidence
-
-if TYPE_CHECKING:
-    from .fit import Fitted
 
 # Factor by which the number of inducing points grows.
 _GROWTH = 1.5
@@ -44,15 +43,6 @@ _FLAT, _FLAT_PER_ROW = 0.1, 0.005
 _BOUND_ROUNDING = 1e-8
 # Length of the natural gradient steps of q: the first, and the smallest.
 _NATURAL_RATES = 0.3, 0.02
-
-
-def exact_twin(sparse: SparseModel, table: ParameterTable, rows: Rows) -> ExactModel:
-    """The exact model of the same rows as a sparse model."""
-    kernels, no_vague = None, np.zeros(sparse.prior.scale.shape, dtype=bool)
-    if sparse.kernels is not None:
-        sets = [sparse.set_of(o, table["inducing_points"]) for o in range(len(sparse.prior.scale))]
-        kernels = tuple(sparse.kernels[group] for group in sets)
-    return ExactModel(sparse.kernel, sparse.prior, no_vague, rows.some(np.arange(len(rows))), kernels)
 
 
 class Part(NamedTuple):

@@ -8,21 +8,16 @@ from scipy.linalg import block_diag, solve_triangular
 
 from skevgp.data.rows import LocalSource, RawRows, Rows
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.calibration import (
+from skevgp.fitting.calibration import VarianceSearch, calibrated, variances
+from skevgp.fitting.folds import (
     PREDICTED_ROWS,
     CrossValidation,
-    LeftOut,
-    Seen,
-    VarianceSearch,
-    calibrated,
     folds_in_order,
     folds_of_groups,
     follow_a_path,
-    prior_of,
     random_folds,
-    sums_of_others,
-    variances,
 )
+from skevgp.model.left_out import LeftOut, Seen, prior_of, sums_of_others
 from skevgp.model.predictor import CoefficientPrior
 from skevgp.model.statistics import collect
 
