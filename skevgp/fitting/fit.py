@@ -116,19 +116,19 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     else:
         predictor = sparse.at_optimum(values, statistics, blocks=model.blocks)
     message = " ".join(part for part in messages if part)
-    one = FittedModel(
-        sparse,
-        model.table,
-        values,
-        statistics,
-        predictor,
-        fit.loss_curve,
-        message,
-        dependent,
-        0 if found is None else found.gone,
-        doubts,
+    fitted = FittedModel(
+        sparse=sparse,
+        table=model.table,
+        values=values,
+        statistics=statistics,
+        predictor=predictor,
+        loss_curve=fit.loss_curve,
+        message=message,
+        dependent=dependent,
+        gone=0 if found is None else found.gone,
+        doubts=doubts,
         known_bound=bound,
         known_upper_bound=upper_bound,
         is_exact=is_exact,
     )
-    return one.told()
+    return fitted.told()

@@ -153,34 +153,34 @@ def models_of(
             table = table.changed("inducing_points", fixed=True)
         columns = range(part.outputs[0], part.outputs[-1] + 1)
         shown = part.outputs[0] if len(part.outputs) == 1 else part.outputs
-        models.append(
-            Model(
-                problem,
-                SparseModel(
-                    own_kernels[0],
-                    units.internal_prior().outputs(part.outputs),
-                    problem.family,
-                    part.groups,
-                    problem.rules.jitter,
-                    stay,
-                    own_kernels if part.split else None,
-                    problem.tight,
-                    problem.orthogonal,
-                ),
-                everything.outputs(part.outputs, share).noisier(problem.row_variance),
-                table,
-                seed,
-                monitor.seen_as(
-                    shift=rows.total * units.log_unit(part.outputs),
-                    outputs=columns if len(columns) == len(part.outputs) else tuple(part.outputs),
-                    about="" if len(parts) == 1 else f"y[:, {shown}]",
-                ),
-                problem.max_iter,
-                problem.tol,
-                None if warm is None else table.started_at(warm).values_at_start(),
-                placed,
-            )
+        sparse = SparseModel(
+            kernel=own_kernels[0],
+            prior=units.internal_prior().outputs(part.outputs),
+            family=problem.family,
+            groups=part.groups,
+            jitter=problem.rules.jitter,
+            complete=stay,
+            kernels=own_kernels if part.split else None,
+            tight=problem.tight,
+            orthogonal=problem.orthogonal,
         )
+        model = Model(
+            problem=problem,
+            sparse=sparse,
+            rows=everything.outputs(part.outputs, share).noisier(problem.row_variance),
+            table=table,
+            seed=seed,
+            monitor=monitor.seen_as(
+                shift=rows.total * units.log_unit(part.outputs),
+                outputs=columns if len(columns) == len(part.outputs) else tuple(part.outputs),
+                about="" if len(parts) == 1 else f"y[:, {shown}]",
+            ),
+            max_iter=problem.max_iter,
+            tol=problem.tol,
+            warm=None if warm is None else table.started_at(warm).values_at_start(),
+            placed=placed,
+        )
+        models.append(model)
     return models
 
 
