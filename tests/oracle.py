@@ -10,14 +10,16 @@ import numpy as np
 from skevgp.data.blocks import LocalBlocks
 from skevgp.data.dataset import Dataset
 from skevgp.data.rows import LocalSource, Moments, RawRows, Rows, block_of
-from skevgp.fitting.search import Rules
+from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import LOG_2PI
+from skevgp.model.left_out import LeftOut, Seen, sums_of_others
 from skevgp.model.model import SparseModel
 from skevgp.model.parameters import Parameter, ParameterTable
 from skevgp.model.predictor import CoefficientPrior
+from skevgp.model.statistics import collect
 
 
 def at_the_fit(model, X, y):
@@ -333,3 +335,25 @@ def negative_elbo(statistics, signal, noise, prior, mean, root, log_det):
     shift = mean + anp.hstack([np.zeros((o, m)), prior.reference])
     divergence = anp.sum(root**2, axis=(1, 2)) + anp.sum(shift**2, axis=1) - (m + p) - log_det
     return 0.5 * anp.sum(data + divergence)
+
+
+# --- rows of a problem, and its held-out rows -------------------------------------------------------------------------
+
+
+def rows_of(rows, chosen, counts=None, precision=None):
+    """Some rows whose internal units are the user's."""
+    weights = (None, None) if counts is None else (counts[chosen], precision[chosen])
+    raw = RawRows(rows.inputs[chosen], rows.features[chosen], rows.residuals[chosen], *weights)
+    return Rows(LocalSource.holding(raw), lambda raw: raw)
+
+
+def left_out(model, values, rows, folds, **weights):
+    """For each group of outputs a LeftOut of each fold."""
+    m, groups = values["inducing_points"].shape[1], []
+    blocks = [model.blocks(rows_of(rows, fold, **weights), m) for fold in folds]
+    for outputs, whitening in zip(model.groups, model.whitenings(values), strict=True):
+        others = sums_of_others([collect(own, whitening, outputs) for own in blocks])
+        seen = [own.sum(Seen(whitening, outputs)) for own in blocks]
+        known = [model.group(values, outputs, whitening, sums) for sums in others]
+        groups.append([LeftOut(group, model.family, own) for group, own in zip(known, seen, strict=True)])
+    return groups

@@ -18,6 +18,8 @@ Total = TypeVar("Total")
 # Indices of outputs.
 Columns = slice | list[int]
 
+# With a smaller unit, the lowest noise variance in the user's units would be rounded to 0.
+SMALLEST_UNIT = 1e-140
 # A sum over rows loads this many rows at once.
 PASS_ROWS = 16_384
 
@@ -140,6 +142,22 @@ class Moments:
     def largest(self) -> np.ndarray:
         """The largest absolute value."""
         return np.maximum(np.abs(self.lowest), np.abs(self.highest))
+
+    @property
+    def constant(self) -> np.ndarray:
+        """Whether the entries of a column differ by a few rounding errors only."""
+        return np.asarray(self.highest - self.lowest <= 8.0 * np.finfo(float).eps * self.largest)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The mean of each column. For a constant column, exactly the constant."""
+        return np.where(self.constant, self.lowest, self.mean)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """The standard deviation of each column. 1 for a constant column."""
+        scale = np.sqrt(self.variance)
+        return np.where(self.constant | (scale <= SMALLEST_UNIT), 1.0, scale)
 
 
 def moments_of_rows(raw: RawRows) -> tuple[Moments, Moments, Moments]:

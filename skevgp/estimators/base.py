@@ -19,7 +19,7 @@ from ..data.dask import as_rows, predict_chunks
 from ..data.dataset import Dataset, checked_numbers, checked_rows
 from ..exceptions import warn_user
 from ..fitting.exact import ExactFit
-from ..fitting.fit import Fitted
+from ..fitting.fitted import Fitted
 from ..fitting.prior import CoefPrior, as_coef_prior, coef_names
 from ..fitting.problem import Problem
 from ..fitting.theta import ThetaPosterior, restricted

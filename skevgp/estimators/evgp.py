@@ -18,8 +18,9 @@ from ..control.posterior import Posterior
 from ..data.dataset import Dataset, checked_numbers
 from ..data.threads import single_threaded_libraries
 from ..exceptions import DependentRowsWarning, warn_user
-from ..fitting.calibration import CrossValidation
-from ..fitting.fit import Fitted, fit_model
+from ..fitting.fit import fit_model
+from ..fitting.fitted import Fitted
+from ..fitting.folds import CrossValidation
 from ..fitting.inducing import Placement
 from ..fitting.messages import DEPENDENT_ROWS, interrupted
 from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,19 +24,15 @@ from ..utils.monitor import Monitor
 from ..utils.validation import LARGEST, as_floats
 from .messages import ended_early, far_from_prior, interrupted, learned_too_little
 from .problem import Problem
-from .search import FeaturesAlone, Fit, Rules, Start, drawn, search
+from .rules import Rules
+from .search import FeaturesAlone, Fit, Start, drawn, search
 from .start import centred_kernels, checked_variance, starting_table, with_signal_of_constants
 from .units import Units, check_independent, may_hide_noise, noise_of_most_evidence
-
-if TYPE_CHECKING:
-    from .model import Model
 
 # Takes θ -> minus the log marginal likelihood, the first θ and bounds=. Returns the best θ and its value, as for GPR.
 Optimizer = Callable[..., tuple[np.ndarray, float]]
 # A user's kernel is checked on so many rows.
 _CHECKED_ROWS = 500
-# Number of rows of the exact model that checks the kernel of a sparse model.
-_SAMPLE = 1000
 # A negligible signal, as a share of one that the user fixes.
 _NO_SIGNAL = 1e-12
 
@@ -170,37 +166,6 @@ class ExactTask:
             best.x = np.clip(theta - in_users_units, lower, upper)
             best.loss = loss(best.x)[0]
         return Fit(table.values(best.x), -n * best.loss, curve)
-
-
-@dataclass(frozen=True)
-class Unhindered:
-    """The fitted exact model of some rows: the kernel without the limits of inducing points."""
-
-    model: ExactModel
-    fit: Fit
-    n_parameters: int
-
-    def missed_by(self, values: Values) -> float:
-        """Loss of log likelihood of the rows at other values, in nats per row and output."""
-        # A fit gains about half a nat per parameter by chance.
-        likelihood = float(self.model.log_likelihoods(values).sum())
-        nats = self.model.rows.total * self.model.rows.targets.shape[1]
-        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
-
-
-def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered | None:
-    """Fit the exact model of a sample of a model's rows. ``tol`` is in nats per row and output.
-
-    Returns None if the kernel is fixed, or groups have their own kernels.
-    """
-    if model.max_iter == 0 or not model.table["hyperparameters"].free.any() or model.sparse.kernels is not None:
-        return None
-    sample, prior = model.rows.sample(_SAMPLE, model.rng), model.sparse.prior
-    exact = ExactModel(model.sparse.kernel, prior, np.zeros(prior.scale.shape, dtype=bool), sample)
-    table, tol = model.table.without("inducing_points"), tol * sample.total * sample.targets.shape[1]
-    tol = max(model.tol or 0.0, tol)
-    task = ExactTask(exact, table, model.scatter, model.rules, max_iter, tol, model.rng, model.monitor.silent())
-    return Unhindered(exact, search(task), table.size)
 
 
 @dataclass(frozen=True)

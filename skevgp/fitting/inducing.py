@@ -13,7 +13,6 @@ from ..data.rows import Moments
 from ..exceptions import ignored
 from ..model.statistics import Kernel, Whitening
 from ..utils.validation import as_floats, check_magnitude
-from .start import column_scale
 
 # First number of points if the number is to be found.
 _FIRST = 10
@@ -124,13 +123,13 @@ def are_all_rows(points: np.ndarray, inputs: np.ndarray) -> bool:
 
 def _rounded(inputs: np.ndarray, moments: Moments) -> np.ndarray:
     """Rows in standard deviations of their columns, rounded to the digits that count."""
-    return np.round((inputs - moments.mean) / column_scale(moments), _DIGITS)
+    return np.round((inputs - moments.mean) / moments.scale, _DIGITS)
 
 
 def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:
     """Centres of k-means with columns of unit standard deviation. There are fewer if rows differ by rounding only."""
     moments = Moments.of(inputs)
-    scale = column_scale(moments)
+    scale = moments.scale
     # k-means warns if rows differ by rounding only. Fewer points are then correct.
     with ignored("Number of distinct clusters", ConvergenceWarning):
         clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit((inputs - moments.mean) / scale)
@@ -159,7 +158,7 @@ def _least_known(
     variance = np.array(np.broadcast_to(kernel.at(hyperparameters, inputs[:1]).diagonal(prepared), len(inputs)))
     enough = _EXHAUSTED * variance.max()
     moments = Moments.of(inputs)
-    scaled = (inputs - moments.mean) / column_scale(moments)
+    scaled = (inputs - moments.mean) / moments.scale
     distance = np.full(len(inputs), np.inf)
     n_given = 0 if given is None else len(given)
     rows, chosen = np.empty((n_given + n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
@@ -167,7 +166,7 @@ def _least_known(
         whitening = Whitening.of(kernel, np.exp(hyperparameters), given)
         whitening.project(prepared, out=rows[:n_given])
         variance = whitening.unexplained(prepared, rows[:n_given])
-        for point in (given - moments.mean) / column_scale(moments):
+        for point in (given - moments.mean) / moments.scale:
             distance = np.minimum(distance, ((scaled - point) ** 2).sum(axis=1))
     for count in range(n_given, n_given + n_inducing):
         known = count > 0 and not variance.max() > enough

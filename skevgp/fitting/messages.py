@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from ..data.rows import Rows
+from ..data.rows import RawRows, Rows
 from ..model.parameters import ParameterTable, Values
 from ..model.predictor import CoefficientPrior
 from ..model.statistics import Kernel
 from ..solvers.base import Minimum
-from .start import alike_neighbours, neighbours
 
 # Nothing was learned if the noise explains more than this share.
 _NOTHING_LEARNED = 0.99
@@ -26,6 +26,8 @@ _STD_OF_RANGE = 0.15
 _NAMES = 5
 # Noise with outliers is tested with up to this share of outliers.
 _MOST_OUTLIERS = 0.15
+# Number of rows among which neighbours are found.
+_NEIGHBOUR_SAMPLE = 2000
 
 DEPENDENT_ROWS = (
     "Neighbouring rows are similar, and blocks of rows are predicted worse than single rows. std is too small for new "
@@ -173,3 +175,25 @@ def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str
         "predictions are those of the features and the prior mean alone. Start the length scales higher, raise their "
         "lower bounds, or raise n_restarts (of the solver, if there is one)."
     )
+
+
+def alike_neighbours(rows: Rows) -> np.ndarray:
+    """Whether neighbouring rows have more similar residuals than noise has, (o,). Then there is something to learn."""
+    # The mean squared difference of residuals between each row and its nearest neighbour is about twice their variance
+    # if they are noise (von Neumann 1941, for ordered rows). Its standard error is about 1.6 / √n of that. Less by four
+    # of these is more than chance.
+    if rows.inputs.constant.all() or len(rows) < 2:
+        return np.zeros(len(rows.scatter()), dtype=bool)
+    each, other = neighbours(rows)
+    difference = np.mean((each.targets - other.targets) ** 2, axis=0)
+    return difference < 2.0 * each.targets.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(each.inputs)))
+
+
+def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawRows]:
+    """Up to ``size`` rows of a sample, and the nearest other row of the sample to each, in standard deviations."""
+    some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
+    inputs = (some.inputs - rows.inputs.mean) / rows.inputs.scale
+    queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
+    _, nearest = cKDTree(inputs).query(inputs[queried], 2)
+    each, other = (some[own] for own in nearest.T)
+    return each, other

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain, pairwise, starmap
 from operator import index
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,22 +15,21 @@ from ..data.blocks import Blocks
 from ..data.rows import Rows, of_outputs
 from ..data.threads import BlockMap
 from ..model.bounds import bounds_alone
-from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.exact import ExactModel, LikelihoodObjective, exact_twin
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
+from .fitted import Fitted
 from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
 from .messages import ended_early, learned_too_little, mini_batches_ended
 from .problem import Problem, Sharing
-from .search import FeaturesAlone, Fit, Rules, Start, drawn
+from .rules import Rules
+from .search import FeaturesAlone, Fit, Start, drawn
 from .start import LOWEST_NOISE, centred_kernels, checked_variance, starting_table
 from .units import may_hide_noise, noise_of_most_evidence
-
-if TYPE_CHECKING:
-    from .fit import Fitted
 
 # Factor by which the number of inducing points grows.
 _GROWTH = 1.5
@@ -44,15 +43,6 @@ _FLAT, _FLAT_PER_ROW = 0.1, 0.005
 _BOUND_ROUNDING = 1e-8
 # Length of the natural gradient steps of q: the first, and the smallest.
 _NATURAL_RATES = 0.3, 0.02
-
-
-def exact_twin(sparse: SparseModel, table: ParameterTable, rows: Rows) -> ExactModel:
-    """The exact model of the same rows as a sparse model."""
-    kernels, no_vague = None, np.zeros(sparse.prior.scale.shape, dtype=bool)
-    if sparse.kernels is not None:
-        sets = [sparse.set_of(o, table["inducing_points"]) for o in range(len(sparse.prior.scale))]
-        kernels = tuple(sparse.kernels[group] for group in sets)
-    return ExactModel(sparse.kernel, sparse.prior, no_vague, rows.some(np.arange(len(rows))), kernels)
 
 
 class Part(NamedTuple):
@@ -163,34 +153,34 @@ def models_of(
             table = table.changed("inducing_points", fixed=True)
         columns = range(part.outputs[0], part.outputs[-1] + 1)
         shown = part.outputs[0] if len(part.outputs) == 1 else part.outputs
-        models.append(
-            Model(
-                problem,
-                SparseModel(
-                    own_kernels[0],
-                    units.internal_prior().outputs(part.outputs),
-                    problem.family,
-                    part.groups,
-                    problem.rules.jitter,
-                    stay,
-                    own_kernels if part.split else None,
-                    problem.tight,
-                    problem.orthogonal,
-                ),
-                everything.outputs(part.outputs, share).noisier(problem.row_variance),
-                table,
-                seed,
-                monitor.seen_as(
-                    shift=rows.total * units.log_unit(part.outputs),
-                    outputs=columns if len(columns) == len(part.outputs) else tuple(part.outputs),
-                    about="" if len(parts) == 1 else f"y[:, {shown}]",
-                ),
-                problem.max_iter,
-                problem.tol,
-                None if warm is None else table.started_at(warm).values_at_start(),
-                placed,
-            )
+        sparse = SparseModel(
+            kernel=own_kernels[0],
+            prior=units.internal_prior().outputs(part.outputs),
+            family=problem.family,
+            groups=part.groups,
+            jitter=problem.rules.jitter,
+            complete=stay,
+            kernels=own_kernels if part.split else None,
+            tight=problem.tight,
+            orthogonal=problem.orthogonal,
         )
+        model = Model(
+            problem=problem,
+            sparse=sparse,
+            rows=everything.outputs(part.outputs, share).noisier(problem.row_variance),
+            table=table,
+            seed=seed,
+            monitor=monitor.seen_as(
+                shift=rows.total * units.log_unit(part.outputs),
+                outputs=columns if len(columns) == len(part.outputs) else tuple(part.outputs),
+                about="" if len(parts) == 1 else f"y[:, {shown}]",
+            ),
+            max_iter=problem.max_iter,
+            tol=problem.tol,
+            warm=None if warm is None else table.started_at(warm).values_at_start(),
+            placed=placed,
+        )
+        models.append(model)
     return models
 
 

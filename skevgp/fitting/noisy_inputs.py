@@ -11,7 +11,7 @@ from ..control.posterior import Posterior
 from ..data.dataset import Dataset
 from ..noise.gaussian import own_variance, relative_noise, row_weights
 from ..utils.monitor import Monitor
-from .fit import Fitted
+from .fitted import Fitted
 
 # Fits and slopes alternate until no output's σ² changes by more than this share, or so many times.
 _SETTLED, _TURNS = 0.05, 5

@@ -20,11 +20,11 @@ from ..noise.base import Noise
 from ..solvers import LBFGS
 from ..solvers.base import Solver
 from ..utils.validation import check_magnitude, check_not_vanishing
-from .calibration import CrossValidation
+from .folds import CrossValidation
 from .inducing import Placement
 from .prior import CoefPrior, InData, coef_names, resolved, says_shared, wide_scale
 from .robust import without_far_targets
-from .search import Rules, rules_of
+from .rules import Rules, rules_of
 from .units import LeftOver, Units, triangles_of_features
 
 # An infinite prior scale becomes this many times the scale of weights without prior knowledge.

@@ -6,20 +6,17 @@ enough. docs/guide/inside.md has a table of the rules, what each prevents, and t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from ..model.parameters import ParameterTable, Values
 from ..model.predictor import Predictor
-from ..solvers.base import Solver
-from ..utils.linalg import JITTER, Jitter
-
-if TYPE_CHECKING:
-    from .exact import ExactTask
-    from .model import Model
+from ..utils.monitor import Monitor
+from .rules import Rules
 
 # In nats. With a smaller difference, rounding decides whether a white kernel or noise has the higher bound.
 _WORTH = 0.01
@@ -27,90 +24,6 @@ _WORTH = 0.01
 _SEEN = 1.0
 # Share of the mean noise variance. A signal this small costs almost nothing, and its gradient shows if it should grow.
 _LITTLE = 1e-4
-# Largest number of floats of a sample. Samples are held in memory.
-LARGEST_SAMPLE = 2_000_000
-# Lower limit of the noise in the exact model. Above it, rounding does not matter. A smooth function is met to 1e-6.
-LOWEST_NOISE_EXACT = 1e-12
-
-
-@dataclass(frozen=True)
-class Rules:
-    """The numbers that control a search. docs/guide/inside.md says what each prevents."""
-
-    # Default start of the noise variance, as a share of the residuals' variance. A low one keeps L-BFGS out of the
-    # optimum where the noise explains everything.
-    first_noise: float
-    # Its lower limit in the same units. Below 1e-10, the rounding errors of k(x, x) - |v|² in a sparse model are larger
-    # than the noise.
-    lowest_noise: float = 1e-10
-    # The lower limit if all rows are inducing points, so that the exact model is used. None: always the sparse model.
-    lowest_noise_exact: float | None = None
-    # Its upper limit, in units of the residuals' variance. A fit that starts there or above may go up to the targets'
-    # variance.
-    highest_noise: float = 1e2
-    # Start of the length scales, in standard deviations of their column times √d. Rows are then neither all similar nor
-    # all uncorrelated, for any number of columns.
-    lengthscale: float = 0.6
-    # Their limits in the same units. The lower one is without √d.
-    lengthscale_limits: tuple[float, float] = (1e-2, 1e4)
-    # Limits of the signal variance, in units of the residuals' variance. L-BFGS may step far from a first guess.
-    # Without an upper limit it makes long waves of huge height from small ones.
-    signal_limits: tuple[float, float] = (1e-8, 1e2)
-    # The upper limit for a fit that continues another one from the first limit: for polynomials and for sums of
-    # functions of single columns, a stationary kernel needs a long length scale and a high signal. None: no such fit.
-    widest_signal: float | None = 1e4
-    # Jitter of k(X_m, X_m).
-    jitter: Jitter = JITTER
-    # An output is not learned if the noise explains this share of the residuals' variance.
-    collapsed: float = 0.9
-    # Starts after a collapsed fit: factors on the first length scales and the first noise variance.
-    other_starts: tuple[tuple[float, float], ...] = ()
-    # Whether a fit that ended below the features alone starts once more, from the noise that is best for these.
-    last_start: bool = True
-    # Factor on the first noise for a second start, tried on a sample or with a point for each row, where it costs
-    # little. A low noise may lead to a plateau where the kernel explains each row by itself.
-    much_noise: float | None = None
-    # Inducing points are placed again after ``stage`` iterations on all rows or on the smallest sample. After ``stage``
-    # more, the better fit is kept. None: the points are placed once.
-    stage: int | None = None
-    # The first sample has so many rows, or so many per inducing point and feature if that is more. None: all rows.
-    sample: tuple[int, int] | None = None
-    # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
-    # `LARGEST_SAMPLE`, are left out.
-    growth: int = 4
-    # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
-    # first ones. A small sample may not show that a column matters.
-    longest: float = 3.0
-    # A restart multiplies the first values by random numbers between 1 / factor and the factor, log-uniformly.
-    restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
-
-    def samples(self, n_rows: int, n_weights: int, width: int) -> tuple[int, ...]:
-        """Sizes of the samples that a fit begins with. Empty if there are too few rows (of ``width`` numbers)."""
-        if self.sample is None:
-            return ()
-        sizes, size = [], max(self.sample[0], self.sample[1] * n_weights)
-        while size <= min(n_rows // 2, LARGEST_SAMPLE // width):
-            sizes.append(size)
-            size *= self.growth
-        return tuple(sizes)
-
-
-# Rules for a solver that sees all rows, and for one that sees mini-batches. Adam's steps do not grow with the gradient:
-# the noise starts closer to the variance of the data, and inducing points are placed once.
-RULES = Rules(
-    first_noise=1e-4,
-    lowest_noise_exact=LOWEST_NOISE_EXACT,
-    other_starts=((0.5, 1.0), (2.0, 100.0), (1.0, 1e3)),
-    much_noise=1e3,
-    stage=25,
-    sample=(1000, 20),
-)
-MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
-
-
-def rules_of(solver: Solver) -> Rules:
-    """The rules for a solver."""
-    return MINI_BATCH_RULES if solver.stochastic else RULES
 
 
 @dataclass(frozen=True)
@@ -181,11 +94,77 @@ class Start:
         return [] if self.after is None else self.after.loss_curve
 
 
+class Task(Protocol):
+    """What is searched: parameters with starts and limits, and a solver."""
+
+    @property
+    def table(self) -> ParameterTable:
+        """The parameters with first values and limits."""
+
+    @property
+    def rules(self) -> Rules:
+        """The rules of the search."""
+
+    @property
+    def max_iter(self) -> int:
+        """Largest number of iterations."""
+
+    @property
+    def monitor(self) -> Monitor:
+        """The monitor, which knows whether the fit was stopped."""
+
+    @property
+    def warm(self) -> Values | None:
+        """First values from another fit."""
+
+    @property
+    def placed(self) -> bool:
+        """Whether the first values have the inducing points of another fit."""
+
+    @property
+    def n_restarts(self) -> int:
+        """Number of further fits from random starts."""
+
+    @property
+    def mean_precision(self) -> float:
+        """Mean precision of the rows, in units of 1/σ²."""
+
+    @property
+    def scatter(self) -> np.ndarray:
+        """Noise variances (o,) that would explain all of the residuals."""
+
+    @property
+    def alone(self) -> FeaturesAlone:
+        """The bound of the features without a Gaussian process."""
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether there are as many inducing points as rows, or none at all."""
+
+    @property
+    def samples(self) -> tuple[int, ...]:
+        """Sizes of the samples of rows that the fit begins with."""
+
+    @property
+    def lengthscale_mask(self) -> np.ndarray | bool:
+        """Whether each hyperparameter is the length scale of one of several columns, (n_hyper,)."""
+
+    @property
+    def place(self) -> Callable[[Values], Values] | None:
+        """The function that places inducing points again under the kernel of its argument. None if they stay."""
+
+    def restart(self) -> Values:
+        """Random first values."""
+
+    def minimise(self, start: Start) -> Fit:
+        """Run the solver from a start."""
+
+
 class _StoppedError(Exception):
     """Ctrl-C was pressed or the time is over. The best fit so far is the result."""
 
 
-def search(model: Model | ExactTask) -> Fit:
+def search(model: Task) -> Fit:
     """Fit a model from one start after another and return the best fit. After Ctrl-C, it is the best so far.
 
     Raises KeyboardInterrupt if there is none yet.
@@ -201,7 +180,7 @@ def search(model: Model | ExactTask) -> Fit:
 class Search:
     """The best fit of a model so far, and the rules for the next start."""
 
-    def __init__(self, model: Model | ExactTask):
+    def __init__(self, model: Task):
         self.model, self.rules, self.table, self.max_iter = model, model.rules, model.table, model.max_iter
         self.best: Fit | None = None
 

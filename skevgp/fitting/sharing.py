@@ -6,7 +6,6 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,12 +16,10 @@ from ..solvers import LBFGS
 from ..solvers.base import Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
+from .fitted import Fitted
 from .inducing import Placement
 from .model import Model, models_of
 from .problem import Problem
-
-if TYPE_CHECKING:
-    from .fit import Fitted
 
 # Largest loss of an output, as a share of the gain of its own Gaussian process over features and noise.
 _LARGEST_LOSS = 0.01

@@ -3,49 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from ..data.rows import Moments, RawRows, Rows
+from ..data.rows import Moments, Rows
 from ..kernels.base import Covariance
 from ..kernels.parse import KernelSpec, Start
 from ..model.parameters import Parameter, ParameterTable, Values
 from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup
 from ..model.statistics import Kernel, Whitening
 from ..utils.linalg import NotPositiveDefiniteError, jittered_cholesky
-from .units import SMALLEST_UNIT
-
-if TYPE_CHECKING:
-    from .problem import Problem
+from .problem import Problem
 
 # Lowest noise variance in squared target units: about the rounding error of the residuals.
 LOWEST_NOISE = 1e-20
 # Limits of the factors of the standard deviations of groups of weights.
 _FACTOR_LIMITS = 1e-4, 1e4
-_NEIGHBOUR_SAMPLE = 2000
-
-
-def column_centre(inputs: Moments) -> np.ndarray:
-    """The mean (d,) of each column. For a constant column, exactly the constant."""
-    return np.where(_constant(inputs), inputs.lowest, inputs.mean)
-
-
-def column_scale(inputs: Moments) -> np.ndarray:
-    """The standard deviation (d,) of each column. 1 for a constant column."""
-    scale = np.sqrt(inputs.variance)
-    return np.where(_constant(inputs) | (scale <= SMALLEST_UNIT), 1.0, scale)
 
 
 def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, ...]:
     """The kernel with the centre of its inputs. One for each output that has its own inputs."""
-    return tuple(covariance.centred(own) for own in np.atleast_2d(column_centre(inputs)))
-
-
-def _constant(inputs: Moments) -> np.ndarray:
-    """Whether the entries (d,) of a column differ by a few rounding errors only."""
-    return inputs.highest - inputs.lowest <= 8.0 * np.finfo(float).eps * inputs.largest
+    return tuple(covariance.centred(own) for own in np.atleast_2d(inputs.centre))
 
 
 def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
@@ -81,28 +59,6 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
     return variance
 
 
-def alike_neighbours(rows: Rows) -> np.ndarray:
-    """Whether neighbouring rows have more similar residuals than noise has, (o,). Then there is something to learn."""
-    # The mean squared difference of residuals between each row and its nearest neighbour is about twice their variance
-    # if they are noise (von Neumann 1941, for ordered rows). Its standard error is about 1.6 / √n of that. Less by four
-    # of these is more than chance.
-    if _constant(rows.inputs).all() or len(rows) < 2:
-        return np.zeros(len(rows.scatter()), dtype=bool)
-    each, other = neighbours(rows)
-    difference = np.mean((each.targets - other.targets) ** 2, axis=0)
-    return difference < 2.0 * each.targets.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(each.inputs)))
-
-
-def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawRows]:
-    """Up to ``size`` rows of a sample, and the nearest other row of the sample to each, in standard deviations."""
-    some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
-    inputs = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs)
-    queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
-    _, nearest = cKDTree(inputs).query(inputs[queried], 2)
-    each, other = (some[own] for own in nearest.T)
-    return each, other
-
-
 def starting_table(
     problem: Problem,
     rows: Rows,
@@ -122,7 +78,7 @@ def starting_table(
         rules = replace(rules, lowest_noise=rules.lowest_noise_exact)
     inputs, own, precision, scatter = rows.inputs, rows.columns, rows.mean_precision, rows.scatter()
     target_unit, constant, rounding = units.target_unit[own], units.constant[own], units.rounding[own]
-    o, scale = np.ones(len(target_unit)), column_scale(inputs)
+    o, scale = np.ones(len(target_unit)), inputs.scale
     # Outputs may have their own columns, and groups of outputs their own kernels.
     typical = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale
     if problem.spec.covariance.n_hyperparameters <= 1:
@@ -134,7 +90,7 @@ def starting_table(
         default = starts.hyperparameters.value
     if n_kernels is not None:
         default = np.broadcast_to(default, (n_kernels, default.shape[-1]))
-    signal, highest, centre = o / mean_variance, rules.highest_noise * precision * o, column_centre(inputs)
+    signal, highest, centre = o / mean_variance, rules.highest_noise * precision * o, inputs.centre
     lowest_noise = np.maximum(rules.lowest_noise * scatter, np.maximum(LOWEST_NOISE, rounding) * precision)
     still = bool(np.all(constant))
     shape = (1 if units.prior.shared else len(o)), units.prior.n_groups

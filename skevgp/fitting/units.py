@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.linalg import svd
 
-from ..data.rows import Columns, Moments, RawRows, Rows, Source, times_weights
+from ..data.rows import SMALLEST_UNIT, Columns, Moments, RawRows, Rows, Source, times_weights
 from ..data.threads import BlockMap
 from ..model.predictor import CoefficientPrior, Predictor
 from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse
 
-# With a smaller unit, the lowest noise variance in the user's units would be rounded to 0.
-SMALLEST_UNIT = 1e-140
 # Size of the rounding errors of residuals, as a share of the target's largest value.
 _TARGET_ROUNDING = 1e-14
 # If a smaller share of a feature is independent of the others, sums of products keep few of its digits.

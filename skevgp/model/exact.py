@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import lapack
 
-from ..data.rows import RawRows
+from ..data.rows import RawRows, Rows
 from ..utils.linalg import (
     NotPositiveDefiniteError,
     diagonal_of,
@@ -40,6 +40,7 @@ from ..utils.linalg import (
     triangular_inverse,
 )
 from .bounds import LOG_2PI
+from .model import SparseModel
 from .parameters import ParameterTable, Values, log_prior
 from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
@@ -295,6 +296,15 @@ class ExactModel:
             )
         offset = self.prior.offset
         return Predictor(tuple(groups), values["noise"], offset, np.zeros(len(groups)), self.prior.shared)
+
+
+def exact_twin(sparse: SparseModel, table: ParameterTable, rows: Rows) -> ExactModel:
+    """The exact model of the same rows as a sparse model."""
+    kernels, no_vague = None, np.zeros(sparse.prior.scale.shape, dtype=bool)
+    if sparse.kernels is not None:
+        sets = [sparse.set_of(o, table["inducing_points"]) for o in range(len(sparse.prior.scale))]
+        kernels = tuple(sparse.kernels[group] for group in sets)
+    return ExactModel(sparse.kernel, sparse.prior, no_vague, rows.some(np.arange(len(rows))), kernels)
 
 
 class LikelihoodObjective:

@@ -76,14 +76,13 @@ class CoefficientPrior:
 
     def outputs(self, columns: Columns) -> CoefficientPrior:
         """The prior of some of the outputs."""
-        return CoefficientPrior(
-            self.mean[columns],
-            self.scale[columns],
-            self.reference[columns],
-            None if self.root is None else self.root[columns],
-            self.shared,
-            self.labels,
-            None if self.groups is None else self.groups[columns],
+        return replace(
+            self,
+            mean=self.mean[columns],
+            scale=self.scale[columns],
+            reference=self.reference[columns],
+            root=None if self.root is None else self.root[columns],
+            groups=None if self.groups is None else self.groups[columns],
         )
 
     def scaled(self, factor: np.ndarray) -> CoefficientPrior:

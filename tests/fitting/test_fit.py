@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-from skevgp.fitting import fit, search
-from skevgp.fitting.calibration import CrossValidation
-from skevgp.fitting.exact import exact_model_of_sample
-from skevgp.fitting.fit import finished, grown
+from skevgp.fitting import rules, search
+from skevgp.fitting.fit import finished
+from skevgp.fitting.folds import CrossValidation
+from skevgp.fitting.grown import exact_model_of_sample, grown
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.search import Fit
 from skevgp.utils.monitor import Monitor
@@ -76,7 +76,7 @@ def test_ctrl_c_keeps_what_each_model_has(n_threads):
 
 def sampled(monkeypatch, **changes):
     """A model whose fit begins with 15, then 30 of its rows."""
-    monkeypatch.setattr(search, "RULES", replace(search.RULES, sample=(15, 1), growth=2, stage=5))
+    monkeypatch.setattr(rules, "RULES", replace(rules.RULES, sample=(15, 1), growth=2, stage=5))
     return model_of(n_inducing=5, **changes)
 
 
@@ -122,7 +122,7 @@ def test_number_of_points_grows_from_few(monkeypatch):
     more, found = grown(model)
     assert more.n_inducing > 30
     assert found.values["noise"] < 0.1 * model.scatter
-    monkeypatch.setattr(fit, "exact_model_of_sample", lambda *arguments: None)
+    monkeypatch.setattr("skevgp.fitting.grown.exact_model_of_sample", lambda *arguments: None)
     same, found = grown(model)
     assert same.n_inducing == 10
     assert found.values["noise"] > 0.9 * model.scatter

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from skevgp.fitting import outliers
-from skevgp.fitting.outliers import Look, RowDoubts, look_at, settle
+from skevgp.fitting.doubts import Look, RowDoubts, look_at
+from skevgp.fitting.outliers import settle
 from skevgp.fitting.search import Start, better
 from skevgp.noise import StudentT
 from skevgp.noise.student_t import StudentTScales

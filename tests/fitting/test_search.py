@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from skevgp.fitting.rules import Rules
 from skevgp.fitting.search import (
     FeaturesAlone,
     Fit,
-    Rules,
     better,
     search,
 )

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from skevgp.fitting.search import Rules
-from skevgp.fitting.start import alike_neighbours, parameter_of
+from skevgp.fitting.messages import alike_neighbours
+from skevgp.fitting.rules import Rules
+from skevgp.fitting.start import parameter_of
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.model import SparseModel

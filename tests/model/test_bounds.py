@@ -6,7 +6,7 @@ from autograd import grad
 from sklearn.gaussian_process.kernels import ConstantKernel, DotProduct
 
 from skevgp import EVGPRegressor
-from skevgp.fitting.search import Rules
+from skevgp.fitting.rules import Rules
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import (

@@ -1,0 +1,88 @@
+"""A fit that finds the number of its inducing points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..model.exact import ExactModel
+from ..model.parameters import Values
+from .exact import ExactTask
+from .model import Model
+from .search import Fit, Start, better, search
+
+# Inducing points are added until this raises the bound by less than so many nats per row and output.
+_GAIN = 0.01
+# There are too few points if the kernel gives a sample a lower log likelihood than the kernel of an exact model does,
+# by more than this, in nats per row and output.
+_MISSED = 0.02
+# Largest number of iterations between, and the tolerance, in nats per row and output.
+_ITERATIONS, _COARSE = 60, 2e-4
+# Number of rows of the exact model that checks the kernel of a sparse model.
+_SAMPLE = 1000
+
+
+def grown(model: Model) -> tuple[Model, Fit]:
+    """The best fit, and its model with the number of inducing points that it needs.
+
+    Half as many points again are added, the rows that are predicted worst so far, and the fit continues for a few
+    iterations. This ends when it raises the bound by less than `_GAIN`. Then the last fit but one continues to its end.
+    """
+    # Only the last fit has `max_iter` iterations. If there were too few between, points would be credited with the gain
+    # of further iterations.
+    #
+    # With few points, the noise may explain so much that half as many again change nothing. The kernel of an exact
+    # model of a sample is a second opinion. While it makes the sample more likely than the kernel of the fit does, by
+    # `_MISSED`, points are added, and it is tried as a start at each step.
+    nats = model.rows.total * len(model.scatter)
+    iterations, tol = _ITERATIONS if model.max_iter > 0 else 0, model.tol or 0.0
+    coarse = replace(model, max_iter=iterations, tol=max(tol, _COARSE * nats))
+    fit = search(coarse)
+    with model.monitor.keeping_the_best():
+        unhindered = None if model.monitor.stopped else exact_model_of_sample(model, _ITERATIONS, _COARSE)
+        while not model.monitor.stopped and (more := coarse.with_more(fit.values)) is not None:
+            starts, limited = [fit.values | {"inducing_points": more.table["inducing_points"].start}], False
+            if unhindered is not None and unhindered.missed_by(fit.values) > _MISSED:
+                starts, limited = [*starts, more.placed_under(unhindered.fit.values)], True
+            # The bound at each start, without any iteration.
+            start = max((more.minimise(Start(values, 0)) for values in starts), key=lambda tried: tried.bound)
+            larger = more.minimise(Start(start.values, coarse.max_iter))
+            if larger.bound - fit.bound < _GAIN * nats and not limited:
+                break
+            coarse, fit = more, larger
+    model = replace(coarse, max_iter=model.max_iter, tol=model.tol)
+    if model.max_iter > 0 and not model.monitor.stopped:
+        fit = better(fit, model.minimise(Start(fit.values, model.max_iter)))
+    return model, fit
+
+
+@dataclass(frozen=True)
+class Unhindered:
+    """The fitted exact model of some rows: the kernel without the limits of inducing points."""
+
+    model: ExactModel
+    fit: Fit
+    n_parameters: int
+
+    def missed_by(self, values: Values) -> float:
+        """Loss of log likelihood of the rows at other values, in nats per row and output."""
+        # A fit gains about half a nat per parameter by chance.
+        likelihood = float(self.model.log_likelihoods(values).sum())
+        nats = self.model.rows.total * self.model.rows.targets.shape[1]
+        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
+
+
+def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered | None:
+    """Fit the exact model of a sample of a model's rows. ``tol`` is in nats per row and output.
+
+    Returns None if the kernel is fixed, or groups have their own kernels.
+    """
+    if model.max_iter == 0 or not model.table["hyperparameters"].free.any() or model.sparse.kernels is not None:
+        return None
+    sample, prior = model.rows.sample(_SAMPLE, model.rng), model.sparse.prior
+    exact = ExactModel(model.sparse.kernel, prior, np.zeros(prior.scale.shape, dtype=bool), sample)
+    table, tol = model.table.without("inducing_points"), tol * sample.total * sample.targets.shape[1]
+    tol = max(model.tol or 0.0, tol)
+    task = ExactTask(exact, table, model.scatter, model.rules, max_iter, tol, model.rng, model.monitor.silent())
+    return Unhindered(exact, search(task), table.size)
