@@ -77,26 +77,22 @@ def _first_doubts(model: Model) -> RowDoubts:
     robust, from_robust = _robust_doubts(short, rows, chosen, _doubts_of_medians(short, raw, neighbours))
     if robust.rejected is None:
         return robust
-    fit = search(replace(short, rows=rows.subset(chosen)))
-    look = look_at(rows, predictor_at(short, fit.values))
-    plain = _first_of(look, robust.scales)
+    every = replace(short, rows=rows.subset(chosen))
+    from_plain = search(every).values
+    plain = _first_of(look_at(rows, predictor_at(every, from_plain)), robust.scales)
     if neighbours.together(robust.rejected) > _TOGETHER:
         return plain
-    scores = [
-        _evidence(short, rows, chosen, doubts, values)
-        for doubts, values in ((robust, from_robust), (plain, fit.values))
-    ]
-    return robust if scores[0] > scores[1] else plain
+    found = _evidence(short, rows, chosen, robust, from_robust), _evidence(short, rows, chosen, plain, from_plain)
+    return robust if found[0] > found[1] else plain
 
 
 def _evidence(model: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts, values: Values) -> float:
-    """The bound of the rows that are not rejected, plus the log density of the others as outliers, in nats."""
-    rejected = np.zeros(len(chosen), dtype=bool) if doubts.rejected is None else doubts.rejected[chosen]
-    seen = rows.subset(chosen)
-    fit = replace(model, rows=without(seen, rejected)).minimise(Start(values, model.max_iter))
-    if not rejected.any():
+    """The bound of chosen rows that are not rejected, plus the log density of the others as outliers, in nats."""
+    others = replace(model, rows=doubts.without_outliers(doubts.weigh(rows)).subset(chosen))
+    fit = others.minimise(Start(values, model.max_iter))
+    if doubts.rejected is None or not (rejected := doubts.rejected[chosen]).any():
         return fit.bound
-    look = look_at(seen, predictor_at(model, fit.values))
+    look = look_at(rows.subset(chosen), predictor_at(others, fit.values))
     share, scale = rejected.mean(), _OUTLIER_WIDTH * np.sqrt(fit.values["noise"])
     wide = student_t.logpdf(np.sqrt(look.squares[rejected]) / scale, _OUTLIER_DEGREES) - np.log(scale)
     n_others = len(chosen) - rejected.sum()
