@@ -111,10 +111,14 @@ class Look:
         """E(y - g)² / v, (n, o)."""
         return (self.errors**2 + self.latent) / self.variance[:, np.newaxis]
 
-    def far_from_median(self, most: float) -> np.ndarray:
-        """Whether an error of a row (n,) is more than ``most`` standard deviations away from the median error."""
+    def far_from_median(self, most: float, least: np.ndarray | float = 0.0) -> np.ndarray:
+        """Whether an error of a row (n,) is more than ``most`` standard deviations away from the median error.
+
+        The standard deviations (o,) come from a median, and are not below ``least``.
+        """
         distance = np.abs(self.errors - np.median(self.errors, axis=0)) / np.sqrt(self.variance)[:, np.newaxis]
         scale = np.median(distance, axis=0) / np.sqrt(_MEDIAN_SQUARE)
+        scale = np.maximum(scale, least)
         return np.asarray(np.any(distance > most * scale, axis=1))
 
     def beyond(self, variance: np.ndarray) -> np.ndarray:

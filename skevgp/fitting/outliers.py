@@ -31,6 +31,8 @@ _FAR_FROM_MEDIAN = 3.0
 _OUTLIER_DEGREES, _OUTLIER_WIDTH = 4.0, 30.0
 # Of 15 % of outliers at random places, 3 % are next to each other. A larger share than this is no chance.
 _TOGETHER = 0.2
+# Where most errors are almost 0, as of classes, the scale of errors is not below this share of the noise.
+_SHARE_OF_NOISE = 0.25
 # Fewer rows than this do not show which share of them is far off.
 _FEWEST_ROWS = 20
 
@@ -58,7 +60,8 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
     # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
     weighed = replace(weighed, rows=doubts.weigh(rows))
     if len(rows) >= _FEWEST_ROWS:
-        doubts = replace(doubts, far=look_at(rows, predictor_at(weighed, fit.values)).far_from_median(FAR).mean())
+        look, std = look_at(rows, predictor_at(weighed, fit.values)), np.sqrt(fit.values["noise"] * doubts.noise_factor)
+        doubts = replace(doubts, far=float(look.far_from_median(FAR, _SHARE_OF_NOISE * std).mean()))
     return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
 
 

@@ -105,7 +105,7 @@ def test_pieces_in_threads_have_same_bits(in_pieces):
 def little_memory(monkeypatch):
     for name in ("maps.MAPPED_BYTES", "blocks.CACHE_BYTES", "blocks.KEEP_BYTES"):
         monkeypatch.setattr(f"skevgp.data.{name}", 2**20)
-    monkeypatch.setattr("skevgp.fitting.search.LARGEST_SAMPLE", 2**17)
+    monkeypatch.setattr("skevgp.fitting.rules.LARGEST_SAMPLE", 2**17)
 
 
 @pytest.mark.long
