@@ -20,10 +20,11 @@ from ..utils.validation import as_floats, check_magnitude
 # The scale of a weight without prior knowledge is so many times the largest that least squares could give. The prior
 # then changes predictions by 1e-6 of their std.
 _WIDE = 1e3
-# With few rows, it is so many times the rms of y over that of a feature: std would be as wide as the prior. Scales that
-# are learned start there too.
+# With few rows for each weight, a free weight would make std far too wide. Its scale is then so many times the rms of y
+# over that of the feature. Scales that are learned start there too.
 _MODERATE = 10.0
-# Smallest share of a feature that other features do not represent. A still smaller one than the second is rounding.
+# The share of a feature that the others cannot represent counts as at least the first number. Below the second, it is a
+# rounding error, and the features are collinear.
 _INDEPENDENT, _COLLINEAR = 1e-6, 1e-12
 # Rounding errors of correlations.
 _ROUNDING = 1e-8

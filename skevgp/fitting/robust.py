@@ -12,7 +12,7 @@ from ..data.rows import LocalSource
 
 # The prediction of a row is the median of so many neighbours among so many rows, evenly spaced.
 _NEIGHBOURS, _SAMPLE = 15, 5000
-# Outliers are seldom most of so many nearest neighbours of an outlier.
+# An outlier is next to others if most of so many of its nearest neighbours are outliers.
 _CLOSE = 5
 # Share of the rows that set the scale of errors: a larger one would include outliers.
 _ORDINARY = 0.7
