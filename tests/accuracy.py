@@ -149,8 +149,7 @@ class Collapsed:
         gradient = None
         if not self.added:
             fitted, blocks = at_the_fit(self.model, self.problem.X, self.problem.y)
-            terms = partial(bounds_at_optimum, family=self.family)
-            gradient = in_order(evaluate(fitted.sparse, fitted.values, blocks, terms)[1])
+            gradient = in_order(evaluate(fitted.sparse, fitted.values, blocks, bounds_at_optimum)[1])
         return Figures(self.model.lower_bound_, gradient, mean, std**2)
 
     def figures(self, precise, gradient=True):
@@ -212,8 +211,9 @@ class Exact:
 
     def found(self):
         mean, std = self.model.predict(self.problem.X_new, return_std=True, include_noise=False)
-        fitted = self.model._fitted
-        gradient = in_order(fitted.model.log_likelihood(fitted.fit.values)[1], ("hyperparameters", "signal", "noise"))
+        (fitted,) = self.model._fitted.models
+        gradient = fitted.posterior.exact.log_likelihood(fitted.values)[1]
+        gradient = in_order(gradient, ("hyperparameters", "signal", "noise"))
         return Figures(self.model.log_marginal_likelihood_value_, gradient, mean, std**2)
 
     def figures(self, precise, gradient=True):

@@ -14,7 +14,7 @@ from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
-from skevgp.model.bounds import LOG_2PI
+from skevgp.model.bounds import LOG_2PI, Variant
 from skevgp.model.left_out import LeftOut, Seen, sums_of_others
 from skevgp.model.model import SparseModel
 from skevgp.model.parameters import Parameter, ParameterTable
@@ -274,7 +274,7 @@ def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     prior = CoefficientPrior(np.zeros((o, p)), 0.5 + rng.rand(o, p), 0.3 * rng.randn(o, p))
     rows = ArrayRows(X, H, Y - H @ prior.offset.T)
     groups = (slice(0, o),) if shared else tuple(slice(i, i + 1) for i in range(o))
-    model = SparseModel(SquaredExponential(d), prior, family, groups)
+    model = SparseModel(SquaredExponential(d), prior, groups, Variant(family))
     Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
     return model, rows, table_of(X, Z, Starts(*starts), np.ones(o), d)
@@ -355,5 +355,5 @@ def left_out(model, values, rows, folds, **weights):
         others = sums_of_others([collect(own, whitening, outputs) for own in blocks])
         seen = [own.sum(Seen(whitening, outputs)) for own in blocks]
         known = [model.group(values, outputs, whitening, sums) for sums in others]
-        groups.append([LeftOut(group, model.family, own) for group, own in zip(known, seen, strict=True)])
+        groups.append([LeftOut(group, model.variant.family, own) for group, own in zip(known, seen, strict=True)])
     return groups

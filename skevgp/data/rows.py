@@ -297,6 +297,10 @@ def block_of(
     return SplitBlock({group.start: block for group, block in zip(groups, blocks, strict=True)})
 
 
+def _as_it_is(raw: RawRows) -> RawRows:
+    return raw
+
+
 def _internal_moments(to_internal: ToInternal, raw: RawRows) -> tuple[Moments, Moments]:
     """Moments of the inputs, weighted by w, and of the residuals, weighted by ω."""
     rows = to_internal(raw)
@@ -320,6 +324,11 @@ class Rows:
     constant: np.ndarray | None = None
     # (outputs,): the variance of the residuals' rounding. None: 0.
     rounding: np.ndarray | None = None
+
+    @classmethod
+    def in_internal_units(cls, raw: RawRows) -> Self:
+        """Rows that are in internal units already."""
+        return cls(LocalSource.holding(raw), _as_it_is)
 
     def __len__(self) -> int:
         return self.source.n_rows
@@ -365,12 +374,15 @@ class Rows:
         """Load rows by index, in internal units."""
         return self.to_internal(self.source.take(chosen)).of(self.columns)
 
+    def chosen(self, size: int, rng: np.random.RandomState) -> np.ndarray:
+        """Indices of all rows, or of ``size`` random ones, in their order."""
+        if len(self) <= size:
+            return np.arange(len(self))
+        return np.sort(sample_without_replacement(len(self), size, random_state=rng))
+
     def sample(self, size: int, rng: np.random.RandomState) -> RawRows:
         """Load all rows, or ``size`` random rows in their order."""
-        chosen = np.arange(len(self))
-        if len(self) > size:
-            chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
-        return self.some(chosen)
+        return self.some(self.chosen(size, rng))
 
     def random_subset(self, size: int, rng: np.random.RandomState) -> Rows:
         """``size`` random rows in random order, held in memory."""

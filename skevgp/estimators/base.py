@@ -18,7 +18,6 @@ from ..control.posterior import Posterior, Rows, delegate
 from ..data.dask import as_rows, predict_chunks
 from ..data.dataset import Dataset, checked_numbers, checked_rows
 from ..exceptions import warn_user
-from ..fitting.exact import ExactFit
 from ..fitting.fitted import Fitted
 from ..fitting.prior import CoefPrior, as_coef_prior, coef_names
 from ..fitting.problem import Problem
@@ -90,7 +89,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     solver: Any
 
     _posterior: Posterior
-    _fitted: Fitted | ExactFit
+    _fitted: Fitted
     # The posterior of the parameters of the feature map, if it has any.
     _theta: ThetaPosterior | None = None
 
@@ -304,7 +303,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         data: Dataset,
         problem: Problem,
         spec: KernelSpec,
-        fitted: Fitted | ExactFit,
+        fitted: Fitted,
         theta: ThetaPosterior | None = None,
     ) -> None:
         """Store the posterior of a fit, and the attributes that describe it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -17,16 +17,24 @@ from sklearn.utils import check_random_state
 from ..control.posterior import Posterior
 from ..data.dataset import Dataset
 from ..data.threads import single_threaded_libraries
-from ..fitting.exact import ExactFit, fit_exact, value_at
+from ..fitting.fit import fit_model
+from ..fitting.fitted import Fitted
+from ..fitting.inducing import Placement
 from ..fitting.messages import interrupted
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem
 from ..fitting.start import prior_predictor
 from ..fitting.theta import calibrate, rough_tol
+from ..model.bounds import Variant
+from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.posterior import ExactPosterior
 from ..noise import Gaussian, as_noise
-from ..utils.monitor import monitor_of
+from ..solvers import LBFGS
+from ..solvers.base import Limits, Minimum, Solver, Tolerance
+from ..utils.linalg import NotPositiveDefiniteError
+from ..utils.monitor import Monitor, monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import check_fitted, is_dask, unchanged_if_it_fails
+from ..utils.validation import LARGEST, as_floats, check_fitted, is_dask, unchanged_if_it_fails
 from .base import GaussianProcess, names_moved_arguments
 
 # Number of rows up to which an iteration takes a few milliseconds at most.
@@ -170,8 +178,6 @@ class EGPRegressor(GaussianProcess):
         "verbose": ["verbose"],
     }
 
-    _fitted: ExactFit
-
     @names_moved_arguments
     def __init__(
         self,
@@ -253,13 +259,17 @@ class EGPRegressor(GaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             data = Dataset.from_user(self, X, y, sample_weight, relative_variance)
             problem = self._problem(data)
-            problem = replace(problem, max_iter=0 if self.optimizer is None else self.max_iter)
             rng, vague = check_random_state(self.random_state), problem.vague
 
-            def fit(problem: Problem, previous: ExactFit | None, rough: bool, about: str) -> ExactFit:
-                tol = max(self._tolerance(data.source.n_rows), rough_tol(problem) if rough else 0.0)
-                optimizer = self.optimizer if callable(self.optimizer) else None
-                return fit_exact(problem, rng, monitor.seen_as(about=about), self.n_restarts, tol, optimizer, previous)
+            def fit(problem: Problem, previous: Fitted | None, rough: bool, about: str) -> Fitted:
+                tol = self._tolerance(data.source.n_rows)
+                problem = replace(
+                    problem,
+                    solver=self._solver(problem.units.target_unit),
+                    max_iter=0 if self.optimizer is None else self.max_iter,
+                    tol=max(tol, rough_tol(problem)) if rough else tol,
+                )
+                return fit_model(problem, rng, monitor.seen_as(about=about), previous)
 
             calibration = calibrate(data, problem, fit, rng, monitor)
             if calibration is None:
@@ -271,7 +281,7 @@ class EGPRegressor(GaussianProcess):
             if vague.any():
                 self.coef_prior_scale_[vague[0] if self.coef_prior_scale_.ndim == 1 else vague] = np.inf
             self._spec = problem.spec
-            self.log_marginal_likelihood_value_ = fitted.log_marginal_likelihood - self._counted_twice
+            self.log_marginal_likelihood_value_ = fitted.lower_bound - self._counted_twice
             self.loss_curve_ = fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
         self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
@@ -305,7 +315,18 @@ class EGPRegressor(GaussianProcess):
                     "it. Pass one of them only."
                 )
             spec = spec.with_noise(self.alpha, fixed=True)
-        return replace(problem, spec=spec, orthogonal=self.discrepancy == "orthogonal")
+        return replace(
+            problem,
+            spec=spec,
+            placement=Placement("all rows", 0),
+            sharing="kernel" if problem.per_output else "all",
+            variant=Variant(orthogonal=self.discrepancy == "orthogonal"),
+        )
+
+    def _solver(self, target_unit: np.ndarray) -> Solver:
+        if callable(self.optimizer):
+            return UserOptimizer(self.optimizer, target_unit, self.n_restarts)
+        return LBFGS(n_restarts=self.n_restarts)
 
     def _tolerance(self, n_rows: int) -> float:
         if isinstance(self.tol, str):
@@ -386,10 +407,143 @@ class EGPRegressor(GaussianProcess):
             if self._spec.adds_signal:
                 fitted = [np.append(own[:-2], [1.0, own[-1]]) for own in fitted]
         with single_threaded_libraries():
-            found = value_at(theta, eval_gradient, order, fitted, self._fitted.log_likelihood_at)
+            found = value_at(theta, eval_gradient, order, fitted, self._log_likelihood_of)
         found = (found[0] - self._counted_twice, found[1]) if eval_gradient else found - self._counted_twice
         if not clone_kernel:
             kernels, thetas = np.atleast_1d(self.kernel_), np.atleast_2d(np.asarray(theta, dtype=np.float64))
             for kernel, own in zip(kernels, thetas, strict=True):
                 kernel.theta = own
         return found
+
+    def _log_likelihood_of(self, output: int, numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log likelihood of an output at other numbers, and its gradient in their logarithms.
+
+        ``numbers`` (n_hyper + 2,) are the hyperparameters of k̃, s² and σ², in the user's units. So is the value, in
+        nats.
+        """
+        posterior, target_unit = self._fitted.models[0].posterior, self._fitted.units.target_unit
+        assert isinstance(posterior, ExactPosterior)
+        exact, only, variance = posterior.exact, slice(output, output + 1), target_unit[output] ** 2
+        kernel = exact.kernel if exact.kernels is None else exact.kernels[output]
+        prior = exact.prior.at(posterior.values).outputs(only)
+        *hyperparameters, signal, noise = numbers
+        values = {
+            "hyperparameters": np.array(hyperparameters),
+            "signal": np.array([signal / variance]),
+            "noise": np.array([noise / variance]),
+        }
+        of_output = ExactModel(kernel, prior, exact.vague[only], exact.rows.of(only))
+        value, gradient = of_output.log_likelihood(values)
+        shift = exact.n_contrasts[output] * np.log(target_unit[output])
+        return value - float(shift), np.concatenate([gradient[name] for name in values])
+
+
+# --- optimizers of the user -------------------------------------------------------------------------------------------
+
+# Takes θ -> minus the log marginal likelihood, the first θ and bounds=. Returns the best θ and its value, as for GPR.
+Optimizer = Callable[..., tuple[np.ndarray, float]]
+
+
+class UserOptimizer(Solver):
+    """A function of the user as a solver of the exact model. It sees logarithms in the user's units."""
+
+    takes_widest_limits = True
+
+    def __init__(self, optimizer: Optimizer, target_unit: np.ndarray, n_restarts: int = 0):
+        self.optimizer = optimizer
+        self.target_unit = target_unit
+        self.n_restarts = n_restarts
+
+    def minimise(
+        self,
+        objective: LikelihoodObjective,
+        start: np.ndarray,
+        limits: Limits,
+        max_iter: int,
+        tolerance: Tolerance,
+        monitor: Monitor,
+        curvature: Any = None,
+    ) -> Minimum:
+        """Run the user's function. Arguments are those of `LBFGS.minimise`. It decides itself when it ends."""
+        if len(start) == 0:
+            return LBFGS().minimise(objective, start, limits, max_iter, tolerance, monitor)
+        table, exact, (lower, upper) = objective.table, objective.model, limits
+        n_rows, log_variance = exact.rows.total, 2.0 * np.log(self.target_unit)
+        shift = float(exact.n_contrasts @ np.log(self.target_unit))
+        in_users_units = table.flat(
+            {
+                parameter.name: log_variance
+                if parameter.name in ("signal", "noise")
+                else np.zeros(parameter.start.shape)
+                for parameter in table.parameters
+            }
+        )
+        best = Minimum(start, np.inf, converged=True)
+
+        def of_theta(theta: np.ndarray, eval_gradient: bool = True) -> Any:
+            theta = np.atleast_1d(np.asarray(theta, dtype=float))
+            if theta.shape != start.shape:
+                raise ValueError(f"theta must be {len(start)} numbers; got an array of shape {theta.shape}.")
+            flat = theta - in_users_units
+            try:
+                loss, gradient = objective(flat)
+            except NotPositiveDefiniteError:
+                loss, gradient = np.inf, np.zeros(len(flat))
+            if loss <= best.loss:
+                best.x, best.loss = flat, loss
+            best.loss_curve.append(loss)
+            monitor.iteration(len(best.loss_curve), loss)
+            value = n_rows * loss + shift
+            return (value, n_rows * gradient) if eval_gradient else value
+
+        with monitor.keeping_the_best():
+            bounds = np.column_stack(limits) + in_users_units[:, np.newaxis]
+            found = self.optimizer(of_theta, start + in_users_units, bounds=bounds)
+            try:
+                theta, _ = found
+                theta = np.asarray(theta, dtype=float)
+            except (TypeError, ValueError):
+                theta = np.empty(0)
+            if theta.shape != start.shape or not np.isfinite(theta).all():
+                raise ValueError(f"optimizer must return {len(start)} finite numbers and their value; got {found!r}.")
+            best.x = np.clip(theta - in_users_units, lower, upper)
+            best.loss = objective(best.x)[0]
+        return best
+
+
+# --- functions of kernels ---------------------------------------------------------------------------------------------
+
+# Maps (output, numbers) to a value, and its gradient in the logarithms of the numbers.
+OfKernel = Callable[[int, np.ndarray], tuple[float, np.ndarray]]
+
+
+def value_at(
+    theta: ArrayLike, eval_gradient: bool, order: np.ndarray, fitted: Sequence[np.ndarray], of_kernel: OfKernel
+) -> Any:
+    """The sum over outputs of a function of kernels at theta and, optionally, its gradient, of the shape of theta.
+
+    ``theta`` is (n_theta,) or, for several outputs, (o, n_theta). ``order`` (n_theta,) is the position of each entry in
+    the numbers (`KernelSpec.order`). ``fitted`` has these numbers of each output (k̃'s hyperparameters, s², perhaps σ²)
+    in the user's units: numbers that are not in theta stay. The value is -inf, as in scikit-learn's
+    GaussianProcessRegressor, if the kernel matrix cannot be factorised. Raises a ValueError if theta has another shape
+    or is out of range.
+    """
+    n_outputs, thetas = len(fitted), as_floats(theta, "theta")
+    shape = (len(order),) if n_outputs == 1 else (n_outputs, len(order))
+    if thetas.shape != shape:
+        each = "" if n_outputs == 1 else " of each of the kernels"
+        raise ValueError(f"theta must be of shape {shape}, as kernel_.theta{each}; got {thetas.shape}.")
+    if not (np.abs(thetas) <= np.log(LARGEST)).all():
+        raise ValueError(f"theta must be logarithms of numbers from {1 / LARGEST:g} to {LARGEST:g}; got {theta!r}.")
+    total, gradient = 0.0, np.zeros((n_outputs, len(order)))
+    for o, own in enumerate(fitted):
+        numbers = own.copy()
+        numbers[order] = np.exp(thetas.reshape(gradient.shape)[o])
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                value, bars = of_kernel(o, numbers)
+        except NotPositiveDefiniteError:
+            return (-np.inf, np.zeros(shape)) if eval_gradient else -np.inf
+        total += value
+        gradient[o] = bars[order]
+    return (total, gradient.reshape(shape)) if eval_gradient else total

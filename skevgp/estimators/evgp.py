@@ -27,6 +27,7 @@ from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem, Sharing
 from ..fitting.theta import ROUGH_ITER, after_more_rows, calibrate, rough_tol
+from ..model.bounds import Variant
 from ..noise import as_noise
 from ..noise.base import Noise
 from ..noise.gaussian import input_covariance, relative_noise
@@ -191,8 +192,6 @@ class EVGPRegressor(GaussianProcess):
         "random_state": ["random_state"],
         "verbose": ["verbose"],
     }
-
-    _fitted: Fitted
 
     @names_moved_arguments
     def __init__(
@@ -443,9 +442,7 @@ class EVGPRegressor(GaussianProcess):
         problem = replace(
             problem,
             sharing=self.sharing,
-            family=solver.posterior,
-            tight=solver.bound == "tight",
-            orthogonal=self.discrepancy == "orthogonal",
+            variant=Variant(solver.posterior, solver.bound == "tight", self.discrepancy == "orthogonal"),
             placement=Placement.of(self.inducing_init, self.n_inducing, most, problem.n_columns),
             solver=solver,
             max_iter=solver.default_max_iter if self.max_iter is None else self.max_iter,

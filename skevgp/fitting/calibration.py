@@ -165,7 +165,7 @@ def _dependent(
 def _left_over(model: SparseModel, values: Values, statistics: list[SufficientStatistics]) -> np.ndarray:
     """Squared error (o,) on the training rows, per degree of freedom."""
     found = np.empty(len(values["noise"]))
-    for bound in bounds_at_optimum(model.groups_of(values, statistics), model.family):
+    for bound in bounds_at_optimum(model.groups_of(values, statistics)):
         group = bound.group
         n_rows = group.statistics.n_rows
         # Rows less the trace of I - B⁻¹, the number of weights that they determine.
@@ -196,7 +196,7 @@ def _searches(
         of_others = sums_of_others([collect(fold, whitening, outputs) for fold in all_of])
         seen = [fold.sum(Seen(whitening, outputs)) for fold in predicted]
         groups = [model.group(values, outputs, whitening, others) for others in of_others]
-        each.append([LeftOut(group, model.family, own) for group, own in zip(groups, seen, strict=True)])
+        each.append([LeftOut(group, model.variant.family, own) for group, own in zip(groups, seen, strict=True)])
     known: list[list[Weights | None]] = [[None] * len(folds)] * len(values["noise"])
     if model.prior.shared:
         known = _known_elsewhere(each)

@@ -64,7 +64,7 @@ class RowDoubts:
 
     def precision(self, sparse: SparseModel, noise: np.ndarray) -> np.ndarray | None:
         """E[τ]/σ² (o, n) of each output and row, if the bound is the tight one."""
-        return self.scales.mean / noise[:, np.newaxis] if sparse.tight else None
+        return self.scales.mean / noise[:, np.newaxis] if sparse.variant.tight else None
 
     def rejects_as(self, other: RowDoubts) -> bool:
         """Whether both reject the same rows."""

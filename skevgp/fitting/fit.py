@@ -7,22 +7,22 @@ from dataclasses import replace
 import numpy as np
 
 from ..data.threads import BlockMap, side_by_side
-from ..model.parameters import log_prior
+from ..model.parameters import Values, log_prior
+from ..model.posterior import SparsePosterior
+from ..model.statistics import SufficientStatistics
 from ..utils.monitor import Monitor
-from .calibration import calibrated
+from .calibration import Calibrated, calibrated
 from .doubts import RowDoubts
 from .fitted import Fitted, FittedModel
+from .folds import CrossValidation
 from .grown import grown
-from .messages import far_from_prior, interrupted, many_outliers, signal_gone
+from .messages import interrupted, many_outliers, signal_gone
 from .model import Model, models_of, parts_of
 from .outliers import fit_doubting
 from .problem import Problem
 from .search import Fit, search
 from .sharing import with_groups
 from .start import with_signal_of_constants
-
-# For a higher ratio of signal to noise variance, the exact predictor is used for duplicate rows too.
-_HIGH_RATIO = 1e9
 
 
 def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, previous: Fitted | None = None) -> Fitted:
@@ -67,68 +67,46 @@ def _best(model: Model) -> tuple[Model, Fit]:
 
 
 def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedModel:
-    """Calibrate signal and noise, compute the bounds and make the predictor of a fit."""
-    sparse, values, exact, by = model.sparse, fit.values, model.exact, model.problem.noise_cv
-    messages = [fit.message, far_from_prior(sparse.prior.at(values), model.rows, model.problem.weight_names)]
-    found, dependent = None, False
-    values, changed = with_signal_of_constants(model.problem, model.rows, model.table, values)
-    statistics = sparse.statistics(values, model.blocks)
-    if not model.monitor.stopped and model.max_iter > 0:
+    """Calibrate signal and noise of a fit, and compute its posterior."""
+    values, changed = with_signal_of_constants(model.problem, model.rows, model.table, fit.values)
+    messages, calibration, statistics = [fit.message, model.far_from_prior(fit.values)], None, None
+    if model.max_iter > 0 and not model.monitor.stopped:
         messages.append(model.learned_too_little(values))
-        if by is not None:
-            # Folds use the algebra of the sparse model, with its lowest noise.
-            lowest = model.rules.lowest_noise * model.scatter
-            noisy = values if exact is None else values | {"noise": np.maximum(values["noise"], lowest)}
+        if model.problem.noise_cv is not None:
+            statistics = model.sparse.statistics(values, model.blocks)
             with model.monitor.keeping_the_best():
-                rows, sums = model.rows, statistics
-                if doubts is not None and doubts.rejected is not None:
-                    rows = doubts.without_outliers(rows)
-                    sums = sparse.statistics(values, sparse.blocks(rows, model.n_inducing))
-                found = calibrated(sparse, noisy, sums, model.table, rows, by, model.seed)
-            dependent = found is not None and found.dependent
-            if exact is not None and by.groups is None:
-                # Folds correct the error of the inducing points. The exact model has none.
-                found = None
-    if found is not None:
-        values = values | {"signal": found.signal, "noise": found.noise}
-        messages.append(signal_gone(found.gone, len(found.noise)))
+                calibration = _calibrated(model, values, statistics, model.problem.noise_cv, doubts)
+    dependent, gone = calibration is not None and calibration.dependent, 0
+    # Folds without groups correct the error of the inducing points. The exact model has none.
+    if calibration is not None and (model.exact is None or model.problem.groups is not None):
+        values, changed = values | {"signal": calibration.signal, "noise": calibration.noise}, True
+        gone = calibration.gone
+        messages.append(signal_gone(gone, len(values["noise"])))
     if doubts is not None:
         messages.append(many_outliers(doubts.far))
-    if sparse.tight and (found is not None or changed):
+    if changed and model.sparse.variant.tight:
         # The charge of the tight bound is that of one signal and noise.
-        statistics = sparse.statistics(values, model.blocks)
-    # If the bound is not known, errors are summed row by row, which keeps digits where the noise is low.
-    known = found is None and not changed and np.isfinite(fit.bound) and fit.n_rows is None
-    if exact is None:
-        bound = fit.bound - log_prior(values) if known else sparse.bound(values, statistics, model.blocks)
-        upper_bound = sparse.upper_bound(values, statistics, model.blocks)
-    else:
-        bound = upper_bound = fit.bound - log_prior(values) if known else float(exact.log_likelihoods(values).sum())
-    # In the sparse predictor, the jitter of k(X_m, X_m) would show in the std.
-    distinct = values["inducing_points"].shape[1] == len(model.rows)
-    is_exact = exact is not None and (distinct or bool((values["signal"] > _HIGH_RATIO * values["noise"]).any()))
-    # An f that is orthogonal to the features is not that of the fit's own predictors.
-    is_exact = is_exact and not sparse.orthogonal
-    if exact is not None and is_exact:
-        predictor = exact.predictor(values)
-    elif found is None and not changed and fit.predictor is not None and not sparse.orthogonal:
-        predictor = fit.predictor
-    else:
-        predictor = sparse.at_optimum(values, statistics, blocks=model.blocks)
+        statistics = None
+    posterior = model.posterior(values, statistics)
+    if fit.predictor is not None and not changed and isinstance(posterior, SparsePosterior):
+        posterior = posterior.with_q(fit.predictor, fit.bound - log_prior(values))
     message = " ".join(part for part in messages if part)
-    fitted = FittedModel(
-        sparse=sparse,
-        table=model.table,
-        values=values,
-        statistics=statistics,
-        predictor=predictor,
-        loss_curve=fit.loss_curve,
-        message=message,
-        dependent=dependent,
-        gone=0 if found is None else found.gone,
-        doubts=doubts,
-        known_bound=bound,
-        known_upper_bound=upper_bound,
-        is_exact=is_exact,
-    )
-    return fitted.told()
+    return FittedModel(posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
+
+
+def _calibrated(
+    model: Model,
+    values: Values,
+    statistics: list[SufficientStatistics],
+    folds: CrossValidation,
+    doubts: RowDoubts | None,
+) -> Calibrated | None:
+    """Signal and noise that predict held-out rows best. Outliers do not count."""
+    rows = model.rows
+    if model.exact is not None:
+        # Folds use the algebra of the sparse model, with its lowest noise.
+        values = values | {"noise": np.maximum(values["noise"], model.rules.lowest_noise * model.scatter)}
+    if doubts is not None and doubts.rejected is not None:
+        rows = doubts.without_outliers(rows)
+        statistics = model.sparse.statistics(values, model.sparse.blocks(rows, model.n_inducing))
+    return calibrated(model.sparse, values, statistics, model.table, rows, folds, model.seed)

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 
 from ..data.rows import Rows, Source
-from ..model.exact import exact_twin
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values
+from ..model.posterior import Posterior, SparsePosterior
 from ..model.predictor import CoefficientPrior, Predictor
-from ..model.statistics import Kernel, SufficientStatistics
+from ..model.statistics import Kernel
 from ..model.weights import WeightLikelihood
 from .doubts import TURNS, RowDoubts, look_at, of_residuals
 from .rules import Rules
@@ -21,15 +21,11 @@ from .units import Units
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A fitted sparse model of some outputs, in internal units."""
+    """A fitted model of some outputs, in internal units."""
 
-    sparse: SparseModel
+    posterior: Posterior
     # The limits and the start of the parameters.
     table: ParameterTable
-    values: Values
-    # For each set of inducing points, at ``values``.
-    statistics: list[SufficientStatistics]
-    predictor: Predictor
     loss_curve: list[float]
     message: str
     # Whether neighbouring rows are alike.
@@ -38,54 +34,34 @@ class FittedModel:
     gone: int = 0
     # Only for noise with heavy tails.
     doubts: RowDoubts | None = None
-    # Only if they are more accurate than from the statistics.
-    known_bound: float | None = None
-    known_upper_bound: float | None = None
-    # Whether the predictor is that of the exact model.
-    is_exact: bool = False
 
-    @cached_property
+    @property
+    def sparse(self) -> SparseModel:
+        """The sparse model. For an exact one, all rows are its inducing points."""
+        return self.posterior.sparse
+
+    @property
+    def values(self) -> Values:
+        """The parameters at the end of the fit."""
+        return self.posterior.values
+
+    @property
     def bound(self) -> float:
-        """Lower bound on the log marginal likelihood of the residuals, in nats, in internal units."""
-        return self.sparse.bound(self.values, self.statistics) if self.known_bound is None else self.known_bound
+        """Lower bound on the log marginal likelihood of the residuals, in nats."""
+        return self.posterior.bound
+
+    @property
+    def upper_bound(self) -> float:
+        """Upper bound on the same. None is known for noise with heavy tails."""
+        return self.posterior.upper_bound if self.doubts is None else np.inf
 
     @cached_property
-    def upper_bound(self) -> float:
-        """Upper bound on the same."""
-        if self.known_upper_bound is not None:
-            return self.known_upper_bound
-        return self.sparse.upper_bound(self.values, self.statistics)
-
-    def moved(self, rows: Rows, prior: CoefficientPrior) -> FittedModel:
-        """The model of the same rows with other features, at the same values."""
-        sparse = replace(self.sparse, prior=prior)
-        blocks = sparse.blocks(rows, self.values["inducing_points"].shape[1])
-        statistics = sparse.statistics(self.values, blocks)
-        if self.is_exact:
-            exact = exact_twin(sparse, self.table, rows)
-            bound, predictor = float(exact.log_likelihoods(self.values).sum()), exact.predictor(self.values)
-        else:
-            bound = sparse.bound(self.values, statistics, blocks)
-            predictor = sparse.at_optimum(self.values, statistics, blocks=blocks)
-        upper = bound if self.is_exact else sparse.upper_bound(self.values, statistics, blocks)
-        return replace(
-            self,
-            sparse=sparse,
-            statistics=statistics,
-            predictor=predictor,
-            known_bound=bound,
-            known_upper_bound=upper,
-        )
-
-    def weight_likelihoods(self, prior: CoefficientPrior, rows: Rows | None) -> list[WeightLikelihood]:
-        """The likelihood of the weights of each output for a prior and, if ``rows`` are given, for their features."""
-        sparse, statistics = replace(self.sparse, prior=prior), self.statistics
-        if rows is not None:
-            if self.is_exact:
-                return exact_twin(sparse, self.table, rows).weight_likelihoods(self.values)
-            blocks = sparse.blocks(rows, self.values["inducing_points"].shape[1])
-            statistics = sparse.statistics(self.values, blocks)
-        return sparse.weight_likelihoods(self.values, statistics)
+    def predictor(self) -> Predictor:
+        """The predictor of residuals, with the noise variance of rows that are not outliers."""
+        predictor = self.posterior.predictor
+        if self.doubts is None:
+            return predictor
+        return replace(predictor, noise=self.values["noise"] * self.doubts.noise_factor)
 
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
         """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.
@@ -94,39 +70,8 @@ class FittedModel:
         """
         if self.doubts is not None:
             return self._updated_doubting(self.doubts, rows)
-        # Points that were all rows before are not all rows now.
-        sparse, values = replace(self.sparse, complete=False), self.values
-        if self.is_exact:
-            # From here on the sparse model is used, with its lowest noise.
-            lowest = np.where(self.table["noise"].free, Rules.lowest_noise, 0.0)
-            values = values | {"noise": np.maximum(values["noise"], lowest)}
-            whitenings = list(sparse.whitenings(values))
-        else:
-            whitenings = [group.whitening for group in self.predictor.groups]
-        before = self.statistics
-        if self.is_exact or weight < 1.0:
-            # The tight charge of earlier rows with another noise or weight is not known from their sums.
-            before = sparse.with_loose_charge(values, before)
-        new = sparse.statistics(values, sparse.blocks(rows, values["inducing_points"].shape[1]), whitenings)
-        statistics = [old.scaled(weight) + more for old, more in zip(before, new, strict=True)]
-        predictor = sparse.at_optimum(values, statistics, whitenings)
-        return replace(
-            self,
-            sparse=sparse,
-            values=values,
-            statistics=statistics,
-            predictor=predictor,
-            known_bound=None,
-            known_upper_bound=None,
-            is_exact=False,
-        )
-
-    def told(self) -> FittedModel:
-        """The model with the noise variance of rows that are not outliers. Then no upper bound is known."""
-        if self.doubts is None:
-            return self
-        predictor = replace(self.predictor, noise=self.values["noise"] * self.doubts.noise_factor)
-        return replace(self, known_upper_bound=np.inf, predictor=predictor)
+        lowest = np.where(self.table["noise"].free, Rules.lowest_noise, 0.0)
+        return replace(self, posterior=self.posterior.updated(rows, weight, lowest))
 
     def _updated_doubting(self, doubts: RowDoubts, rows: Rows) -> FittedModel:
         """The model with new rows, whose noise scales and q alternate. The scales of earlier rows stay.
@@ -143,7 +88,7 @@ class FittedModel:
             doubts = replace(doubts, scales=doubts.scales.at(look.distances(noise)))
             if not doubts.differ_from(before):
                 break
-        return replace(plain.updated(doubts.weigh(rows)), doubts=doubts).told()
+        return replace(plain.updated(doubts.weigh(rows)), doubts=doubts)
 
 
 @dataclass(frozen=True)
@@ -177,17 +122,19 @@ class Fitted:
         units = self._with_prior(prior)
         rows, internal = units.rows(source), units.internal_prior()
         pairs = zip(self.outputs, self.models, strict=True)
-        models = (one.moved(rows.outputs(own), internal.outputs(own)) for own, one in pairs)
+        models = (
+            replace(model, posterior=model.posterior.moved(internal.outputs(outputs), rows.outputs(outputs)))
+            for outputs, model in pairs
+        )
         return replace(self, units=units, models=tuple(models))
 
     def reweighted(self, prior: CoefficientPrior) -> Fitted:
-        """The models with another prior of the weights that has the same offset."""
+        """The models, after new rows, with another prior of the weights that has the same offset."""
         units = self._with_prior(prior)
         internal, models = units.internal_prior(), []
-        for own, one in zip(self.outputs, self.models, strict=True):
-            sparse = replace(one.sparse, prior=internal.outputs(own))
-            predictor = sparse.at_optimum(one.values, one.statistics)
-            models.append(replace(one, sparse=sparse, predictor=predictor, known_bound=None, known_upper_bound=None))
+        for outputs, model in zip(self.outputs, self.models, strict=True):
+            assert isinstance(model.posterior, SparsePosterior)
+            models.append(replace(model, posterior=model.posterior.reweighted(internal.outputs(outputs))))
         return replace(self, units=units, models=tuple(models))
 
     def weight_likelihoods(
@@ -201,7 +148,7 @@ class Fitted:
         rows, internal = None if source is None else units.rows(source), units.internal_prior()
         found: dict[int, WeightLikelihood] = {}
         for own, one in zip(self.outputs, self.models, strict=True):
-            each = one.weight_likelihoods(internal.outputs(own), None if rows is None else rows.outputs(own))
+            each = one.posterior.weight_likelihoods(internal.outputs(own), None if rows is None else rows.outputs(own))
             found |= {o: each[i].in_units(units.target_unit[o]) for i, o in enumerate(own)}
         return [found[o] for o in sorted(found)]
 
@@ -263,8 +210,9 @@ class Fitted:
 
     @property
     def _shift(self) -> float:
-        # Difference of the loss of all rows between the user's and internal units.
-        return self.models[0].statistics[0].n_rows * self.units.log_unit(slice(None))
+        # The loss of all rows in the user's units less that in internal ones.
+        pairs = zip(self.outputs, self.models, strict=True)
+        return sum(self.units.shift(model.posterior.n_contrasts, outputs) for outputs, model in pairs)
 
     @property
     def n_parameters(self) -> int:
@@ -274,7 +222,7 @@ class Fitted:
             n_outputs, p = one.sparse.prior.scale.shape
             m, of_weights = one.values["inducing_points"].shape[1], p + p * (p + 1) // 2
             of_values = m + m * (m + 1) // 2 + m * p
-            if one.sparse.family == "diagonal":
+            if one.sparse.variant.family == "diagonal":
                 of_values, of_weights = 2 * m, 2 * p
             total += one.table.size + n_outputs * of_values
             total += of_weights * (1 if one.sparse.prior.shared else n_outputs)

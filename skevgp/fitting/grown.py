@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..model.exact import ExactModel
 from ..model.parameters import Values
-from .exact import ExactTask
+from ..solvers import LBFGS
 from .model import Model
 from .search import Fit, Start, better, search
 
@@ -61,16 +60,16 @@ def grown(model: Model) -> tuple[Model, Fit]:
 class Unhindered:
     """The fitted exact model of some rows: the kernel without the limits of inducing points."""
 
-    model: ExactModel
+    model: Model
     fit: Fit
-    n_parameters: int
 
     def missed_by(self, values: Values) -> float:
         """Loss of log likelihood of the rows at other values, in nats per row and output."""
+        exact = self.model.exact
+        assert exact is not None
         # A fit gains about half a nat per parameter by chance.
-        likelihood = float(self.model.log_likelihoods(values).sum())
-        nats = self.model.rows.total * self.model.rows.targets.shape[1]
-        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
+        likelihood, by_chance = float(exact.log_likelihoods(values).sum()), 0.5 * self.model.table.size
+        return (self.fit.bound - by_chance - likelihood) / (exact.rows.total * exact.rows.targets.shape[1])
 
 
 def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered | None:
@@ -80,9 +79,19 @@ def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered
     """
     if model.max_iter == 0 or not model.table["hyperparameters"].free.any() or model.sparse.kernels is not None:
         return None
-    sample, prior = model.rows.sample(_SAMPLE, model.rng), model.sparse.prior
-    exact = ExactModel(model.sparse.kernel, prior, np.zeros(prior.scale.shape, dtype=bool), sample)
-    table, tol = model.table.without("inducing_points"), tol * sample.total * sample.targets.shape[1]
-    tol = max(model.tol or 0.0, tol)
-    task = ExactTask(exact, table, model.scatter, model.rules, max_iter, tol, model.rng, model.monitor.silent())
-    return Unhindered(exact, search(task), table.size)
+    rows = model.rows.subset(model.rows.chosen(_SAMPLE, model.rng))
+    points = np.repeat(rows.some(np.arange(len(rows))).inputs[np.newaxis], len(model.sparse.groups), axis=0)
+    sample = replace(
+        model,
+        problem=replace(model.problem, solver=LBFGS()),
+        sparse=replace(model.sparse, complete=True),
+        rows=rows,
+        table=model.table.changed("inducing_points", start=points, fixed=True),
+        monitor=model.monitor.silent(),
+        max_iter=max_iter,
+        tol=max(model.tol or 0.0, tol * rows.total * len(model.scatter)),
+        warm=None,
+        placed=False,
+        is_exact=True,
+    )
+    return Unhindered(sample, search(sample))

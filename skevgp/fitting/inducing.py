@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -30,8 +31,9 @@ _DIGITS = 10
 class Placement:
     """How inducing points are chosen."""
 
-    # The points themselves (m, d), or the name of a method. ``"auto"`` starts as ``"k-means"``.
-    method: Literal["auto", "k-means", "greedy"] | np.ndarray
+    # The points themselves (m, d), or the name of a method. ``"auto"`` starts as ``"k-means"``. ``"all rows"`` is the
+    # exact model.
+    method: Literal["auto", "k-means", "greedy", "all rows"] | np.ndarray
     # Largest number of points at the start. An array has its own number.
     n_inducing: int
     # Largest number of points at the end, if their number is to be found.
@@ -56,6 +58,11 @@ class Placement:
         return cls(points, len(points), most)
 
     @property
+    def takes_all_rows(self) -> bool:
+        """Whether the model is the exact one."""
+        return isinstance(self.method, str) and self.method == "all rows"
+
+    @property
     def anew(self) -> Placement | None:
         """The placement for a second time, when the kernel has learned something. None if the points stay."""
         by_user = isinstance(self.method, np.ndarray)
@@ -64,6 +71,8 @@ class Placement:
     @property
     def sample_size(self) -> int:
         """Number of rows from which points are chosen."""
+        if self.takes_all_rows:
+            return sys.maxsize
         if isinstance(self.method, str) and self.method == "greedy":
             return greedy_sample_size(self.n_inducing)
         return max(MAX_SAMPLE, 10 * self.n_inducing)
@@ -79,6 +88,8 @@ class Placement:
         """
         if isinstance(self.method, np.ndarray):
             return self.method
+        if self.takes_all_rows:
+            return inputs
         distinct = distinct_rows(inputs)
         if len(distinct) <= self.n_inducing:
             return distinct

@@ -15,26 +15,31 @@ from ..data.blocks import Blocks
 from ..data.rows import Rows, of_outputs
 from ..data.threads import BlockMap
 from ..model.bounds import bounds_alone
-from ..model.exact import ExactModel, LikelihoodObjective, exact_twin
+from ..model.exact import ExactModel, LikelihoodObjective, n_contrasts
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
+from ..model.posterior import ExactPosterior, Posterior, SparsePosterior
+from ..model.statistics import SufficientStatistics
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
+from .alone import best_by_likelihood, best_by_sums, features_alone, noise_left_over
 from .fitted import Fitted
 from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
-from .messages import ended_early, learned_too_little, mini_batches_ended
+from .messages import ended_early, far_from_prior, learned_too_little, mini_batches_ended
 from .problem import Problem, Sharing
 from .rules import Rules
 from .search import FeaturesAlone, Fit, Start, drawn
-from .start import LOWEST_NOISE, centred_kernels, checked_variance, starting_table
-from .units import may_hide_noise, noise_of_most_evidence
+from .start import centred_kernels, checked_variance, starting_table
+from .units import check_independent, may_hide_noise
 
 # Factor by which the number of inducing points grows.
 _GROWTH = 1.5
-# Noise variances below this share of the prior sum of squares are lost in rounding.
-_ROUNDING = 1e-13
+# The kernel of a user is checked at so many points.
+_CHECKED_POINTS = 500
+# For a higher ratio of signal to noise variance, the exact predictor is used for duplicate rows too.
+_HIGH_RATIO = 1e9
 # The tolerance of L-BFGS, in nats: this, or this share of the gain over features and noise alone if that is more.
 LEAST_TOL, ENOUGH = 0.01, 1.5e-5
 # The tolerance for a flat loss of mini-batches: in nats, or in nats per row if that is more.
@@ -102,83 +107,86 @@ def models_of(
 ) -> list[Model]:
     """The models of a problem, each with its rows and its start. Arguments are those of `fit_model`."""
     units, placement, parts = problem.units, problem.placement, parts_of(problem)
-    rows, everything = units.rows(problem.first_source, threads), units.rows(problem.source, threads)
+    rows, all_rows = units.rows(problem.first_source, threads), units.rows(problem.source, threads)
 
     # All models start with the same kernel. If outputs have their own inputs, kernels have own centres and points.
     kernels = centred_kernels(problem.spec.covariance, rows.inputs)
     sample, points = rows.sample(placement.sample_size, rng), []
+    if problem.vague.any():
+        check_independent(sample.features, problem.vague, units.prior.shared)
     for output, kernel in enumerate(kernels):
         inputs = sample.of([output]).inputs
         alone = starting_table(problem, rows.outputs([output]), np.empty((1, 0, inputs.shape[1]))).values_at_start()
         points.append(placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng))
-    first = problem.spec.starts.hyperparameters.value
-    variance = 1.0 if first is None else checked_variance(kernels[0], first, points[0])
+    hyperparameters, variance = problem.spec.starts.hyperparameters.value, 1.0
+    if hyperparameters is not None:
+        some = np.unique(np.linspace(0, len(points[0]) - 1, _CHECKED_POINTS).astype(int))
+        variance = checked_variance(kernels[0], hyperparameters, points[0][some])
 
     # All models have the same seed: outputs that share nothing are then fitted as if each was alone.
     seed = rng.randint(np.iinfo(np.int32).max)
     goes_on = previous is not None and previous.outputs == [part.outputs for part in parts]
     models = []
-    for i, part in enumerate(parts):
-        heads = [part.outputs[group.start] for group in part.groups]
-        own_kernels = tuple(kernels[o % len(kernels)] for o in heads)
-        warm: Values | None = None
-        if goes_on and previous is not None:
-            warm = previous.values_in(units, rows, own_kernels[0], i)
-            if isinstance(placement.method, np.ndarray):
-                warm.pop("inducing_points", None)
-        sets, found = [points[o % len(points)] for o in heads], None if warm is None else warm.get("inducing_points")
-        most = placement.max_inducing
+    for number, part in enumerate(parts):
+        outputs, first_outputs = part.outputs, [part.outputs[group.start] for group in part.groups]
+        own_kernels = tuple(kernels[output % len(kernels)] for output in first_outputs)
+        warm = previous.values_in(units, rows, own_kernels[0], number) if goes_on and previous is not None else {}
+        if isinstance(placement.method, np.ndarray):
+            warm.pop("inducing_points", None)
+        sets, sets_before = [points[output % len(points)] for output in first_outputs], warm.get("inducing_points")
         # If the number of points is to be found, it starts from the points of the fit before.
         placed = (
-            found is not None
-            and most is not None
-            and len(found) == len(sets)
-            and found.shape[1] <= min(most, len(rows))
+            sets_before is not None
+            and placement.max_inducing is not None
+            and len(sets_before) == len(sets)
+            and sets_before.shape[1] <= min(placement.max_inducing, len(rows))
         )
-        start = found if placed else np.array([own[: min(map(len, sets))] for own in sets])
-        assert start is not None
+        start = np.array([own[: min(map(len, sets))] for own in sets])
+        if placed and sets_before is not None:
+            start = sets_before
         # If all rows are points, the bound is the likelihood, and no other points are better.
-        stay = (
-            problem.family == "full"
+        complete = placement.takes_all_rows or (
+            problem.variant.family == "full"
             and len(sample.targets) >= len(rows)
-            and all(are_all_rows(own, sample.of([o]).inputs) for own, o in zip(start, heads, strict=True))
+            and all(
+                are_all_rows(own, sample.of([output]).inputs) for own, output in zip(start, first_outputs, strict=True)
+            )
         )
-        share = 1.0 / min(problem.n_threads, len(parts))
-        n_kernels, exact = (
-            len(start) if part.separate else None,
-            stay and not part.separate and not problem.noise.heavy_tails,
-        )
-        table = starting_table(problem, rows.outputs(part.outputs), start, variance, n_kernels, exact)
-        if stay:
+        exact = complete and not part.separate and problem.may_be_exact
+        n_kernels = len(start) if part.separate else None
+        table = starting_table(problem, rows.outputs(outputs), start, variance, n_kernels, exact)
+        if complete:
             table = table.changed("inducing_points", fixed=True)
-        columns = range(part.outputs[0], part.outputs[-1] + 1)
-        shown = part.outputs[0] if len(part.outputs) == 1 else part.outputs
+        if problem.solver.takes_widest_limits:
+            table = table.widened(("signal", "noise"))
         sparse = SparseModel(
             kernel=own_kernels[0],
-            prior=units.internal_prior().outputs(part.outputs),
-            family=problem.family,
+            prior=units.internal_prior().outputs(outputs),
             groups=part.groups,
+            variant=problem.variant,
             jitter=problem.rules.jitter,
-            complete=stay,
+            complete=complete,
             kernels=own_kernels if part.split else None,
-            tight=problem.tight,
-            orthogonal=problem.orthogonal,
         )
+        columns = range(outputs[0], outputs[-1] + 1)
+        shown = outputs[0] if len(outputs) == 1 else outputs
+        contrasts = n_contrasts(rows.total, problem.vague[outputs], units.prior.shared)
         model = Model(
             problem=problem,
             sparse=sparse,
-            rows=everything.outputs(part.outputs, share).noisier(problem.row_variance),
+            rows=all_rows.outputs(outputs, 1.0 / min(problem.n_threads, len(parts))).noisier(problem.row_variance),
             table=table,
             seed=seed,
             monitor=monitor.seen_as(
-                shift=rows.total * units.log_unit(part.outputs),
-                outputs=columns if len(columns) == len(part.outputs) else tuple(part.outputs),
+                shift=units.shift(contrasts, outputs),
+                outputs=columns if len(columns) == len(outputs) else tuple(outputs),
                 about="" if len(parts) == 1 else f"y[:, {shown}]",
             ),
             max_iter=problem.max_iter,
             tol=problem.tol,
-            warm=None if warm is None else table.started_at(warm).values_at_start(),
+            warm=table.started_at(warm).values_at_start() if goes_on else None,
             placed=placed,
+            is_exact=exact,
         )
         models.append(model)
     return models
@@ -201,6 +209,8 @@ class Model:
     # First values from another fit, and whether the table has its inducing points.
     warm: Values | None = None
     placed: bool = False
+    # Whether the likelihood of the exact model takes the place of the bound.
+    is_exact: bool = False
 
     @cached_property
     def rng(self) -> np.random.RandomState:
@@ -252,11 +262,15 @@ class Model:
 
     @cached_property
     def exact(self) -> ExactModel | None:
-        """The exact model of the rows if all rows are inducing points, else None."""
-        sparse, separate = self.sparse, self.table["hyperparameters"].start.ndim == 2
-        if not sparse.complete or separate or self.problem.noise.heavy_tails or self.rules.lowest_noise_exact is None:
+        """The exact model of the rows, or None if a bound is maximised."""
+        if not self.is_exact:
             return None
-        return exact_twin(sparse, self.table, self.rows)
+        return ExactModel.of(self.sparse, self.vague, self.rows.some(np.arange(len(self.rows))))
+
+    @property
+    def vague(self) -> np.ndarray:
+        """Weights (o, p) with an infinite prior scale."""
+        return self.problem.vague[self.rows.columns]
 
     def objective(self, table: ParameterTable, n_rows: int | None = None) -> BoundObjective | LikelihoodObjective:
         """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all."""
@@ -264,52 +278,37 @@ class Model:
             # A smaller sample is the first part of the larger one.
             blocks = self.sparse.blocks(self._sample.subset(np.arange(n_rows)), self.n_inducing)
             # It only gives a start. The bound of Titsias (2009) spreads points better: what they leave out costs more.
-            return BoundObjective(replace(self.sparse, tight=False), table, blocks)
+            loose = replace(self.sparse, variant=replace(self.sparse.variant, tight=False))
+            return BoundObjective(loose, table, blocks)
         if self.exact is not None:
             return LikelihoodObjective(self.exact, table)
         return BoundObjective(self.sparse, table, self.blocks)
+
+    def posterior(self, values: Values, statistics: list[SufficientStatistics] | None = None) -> Posterior:
+        """The posterior at some values. The ``statistics`` of all rows at these are computed if they are None."""
+        if self.exact is not None:
+            # Fewer points than rows make predictions cheaper. The jitter of k(X_m, X_m) would show in a small std.
+            distinct = self.n_inducing == len(self.rows)
+            if distinct or (values["signal"] > _HIGH_RATIO * values["noise"]).any():
+                return ExactPosterior.of(self.sparse, self.exact, values)
+        return SparsePosterior.of(self.sparse, values, self.blocks, statistics)
 
     # --- the features without a Gaussian process ----------------------------------------------------------------------
 
     @cached_property
     def bound_alone(self) -> float:
         """The bound of the features without a Gaussian process, where noise explains all residuals."""
-        none = np.zeros(len(self.sparse.prior.scale))
-        return float(bounds_alone(self.blocks.linear, self.sparse.prior, self._left_over(none), none).sum())
+        sums, none = self.blocks.linear, np.zeros(len(self.sparse.prior.scale))
+        return float(bounds_alone(sums, self.sparse.prior, noise_left_over(self.rows, sums), none).sum())
 
     @cached_property
     def alone(self) -> FeaturesAlone:
         """The bound of the features with as little Gaussian process as the limits allow."""
-        values, signal, rows = self.table.values_at_start(), self.table["signal"], self.rows
-        points, (kernel, hyperparameters) = values["inducing_points"][0], self.sparse.kernel_of(values, 0)
-        variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
-        little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
-        trace = little * variance * rows.total * rows.mean_precision
-        hidden = may_hide_noise(self.sparse.prior, self.blocks.linear.length)
-        bound, noise = self._best_alone(trace, hidden)
-        # The trace of a fixed signal depends on the end of the kernel.
-        is_open = hidden and not signal.free.all()
-        most = self._best_alone(np.zeros(len(trace)), hidden)[0] if is_open else -np.inf
-        return FeaturesAlone(bound, noise, most, hidden)
-
-    def _left_over(self, trace: np.ndarray) -> np.ndarray:
-        """Noise variances (o,) equal to the mean squared residuals of the features, plus a trace of f's prior."""
-        squares = self.blocks.linear.RR
-        return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE * self.rows.mean_precision)
-
-    def _best_alone(self, trace: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
-        """The highest bound with q(f) at its prior, which has a given trace, and the noise variances (o,) for it."""
-        prior, sums = self.sparse.prior, self.blocks.linear
-        least = highest = self._left_over(trace)
-        if self.max_iter > 0 and hidden:
-            lowest, highest = self.table["noise"].value_limits().T
-            # Directions without data have a precision of 1, which is lost in rounding next to large features.
-            sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1))[0]) for o, scale in enumerate(prior.scale)]
-            unseen = [np.sort(own)[: max(len(own) - sums.length, 0)].sum() for own in sizes]
-            least = np.maximum(lowest, _ROUNDING * np.array(unseen))
-        return noise_of_most_evidence(
-            lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared
-        )
+        hidden = may_hide_noise(self.sparse.prior, len(self.rows))
+        if self.exact is not None:
+            return features_alone(self.table, hidden, partial(best_by_likelihood, self.exact, self.table, hidden))
+        by_sums = partial(best_by_sums, self.sparse, self.table, self.rows, self.blocks.linear, hidden)
+        return features_alone(self.table, hidden, by_sums)
 
     # --- starts -------------------------------------------------------------------------------------------------------
 
@@ -331,7 +330,8 @@ class Model:
 
     def restart(self) -> Values:
         """Random first values."""
-        return self._placed(drawn(self.table, self.rules, self.rng), self.problem.placement)
+        values = drawn(self.table, self.rules, self.rng)
+        return self._placed(values, self.problem.placement) if self.table["inducing_points"].free.any() else values
 
     def _placed(self, values: Values, placement: Placement) -> Values:
         """The same values with inducing points placed under their kernel, equal for groups with the same kernel."""
@@ -370,10 +370,11 @@ class Model:
         if n_inducing <= self.n_inducing:
             return None
         table = self.table.changed("inducing_points", start=np.array([own[:n_inducing] for own in sets]))
-        if everything and self.sparse.family == "full":
+        if everything and self.sparse.variant.family == "full":
             # The bound is then the likelihood, and no other points are better.
             table = table.changed("inducing_points", fixed=True)
-            return replace(self, table=table, sparse=replace(self.sparse, complete=True))
+            exact = self.problem.may_be_exact and table["hyperparameters"].start.ndim == 1
+            return replace(self, table=table, sparse=replace(self.sparse, complete=True), is_exact=exact)
         return replace(self, table=table)
 
     # --- the way from a start -----------------------------------------------------------------------------------------
@@ -392,9 +393,10 @@ class Model:
         about = "all rows" if start.n_rows is None else f"{start.n_rows:,} of {len(self.rows):,} rows"
         if self.problem.placement.max_inducing is not None:
             about = f"{self.n_inducing} points, {about}"
-        tolerance = Tolerance(LEAST_TOL / n_rows, ENOUGH, -self.bound_alone / n_rows)
         if self.tol is not None and start.n_rows is None:
             tolerance = Tolerance(self.tol / n_rows)
+        else:
+            tolerance = Tolerance(LEAST_TOL / n_rows, ENOUGH, -self.bound_alone / n_rows)
         curvature = None
         if not start.cold:
             # The curvature on the smallest sample, or on all rows.
@@ -408,12 +410,13 @@ class Model:
             self.monitor.seen_as(spent, n_rows, about=about),
             curvature,
         )
+        n_iter, name = spent + minimum.n_iter, type(solver).__name__
         return Fit(
             table.values(minimum.x),
             -n_rows * minimum.loss,
             start.loss_curve + [n_rows * loss for loss in minimum.loss_curve],
             minimum.converged,
-            ended_early(type(solver).__name__, minimum, spent + minimum.n_iter, self.max_iter, self.tol),
+            ended_early(name, minimum, n_iter, self.max_iter, self.tol, self.has_inducing_points),
             n_rows=start.n_rows,
         )
 
@@ -455,14 +458,29 @@ class Model:
             predictor,
         )
 
+    # --- messages -----------------------------------------------------------------------------------------------------
+
+    @property
+    def has_inducing_points(self) -> bool:
+        """Whether the user knows of inducing points."""
+        return not self.problem.placement.takes_all_rows
+
+    def far_from_prior(self, values: Values) -> str:
+        """The message of `messages.far_from_prior`. Vague weights are never far."""
+        prior = self.sparse.prior.at(values)
+        proper = replace(prior, reference=np.where(self.vague, 0.0, prior.reference))
+        return far_from_prior(proper, self.rows, self.problem.weight_names)
+
     def learned_too_little(self, values: Values) -> str:
         """The message of `messages.learned_too_little`, for each group with its own columns. Empty if all is well."""
+        sparse, has_points = self.sparse, self.has_inducing_points
         if self.rows.inputs.mean.ndim == 1:
-            kernel, hyperparameters = self.sparse.kernel_of(values, 0)
-            return learned_too_little(kernel, values | {"hyperparameters": hyperparameters}, self.table, self.rows)
-        told = []
-        for group, outputs in enumerate(self.sparse.groups):
-            kernel, hyperparameters = self.sparse.kernel_of(values, group)
-            own = {"hyperparameters": hyperparameters, "noise": values["noise"][outputs]}
-            told.append(learned_too_little(kernel, own, self.table, self.rows.outputs(outputs)))
-        return max(told)
+            kernel, hyperparameters = sparse.kernel_of(values, 0)
+            values = values | {"hyperparameters": hyperparameters}
+            return learned_too_little(kernel, values, self.table, self.rows, has_points)
+        messages = []
+        for group, outputs in enumerate(sparse.groups):
+            kernel, hyperparameters = sparse.kernel_of(values, group)
+            of_group = {"hyperparameters": hyperparameters, "noise": values["noise"][outputs]}
+            messages.append(learned_too_little(kernel, of_group, self.table, self.rows.outputs(outputs), has_points))
+        return max(messages)

@@ -13,7 +13,7 @@ from ..data.dataset import Dataset
 from ..data.maps import RowShapes
 from ..data.rows import LocalSource, Moments, Source, moments_of_rows
 from ..kernels.parse import KernelSpec, parse_kernel
-from ..model.bounds import PosteriorFamily
+from ..model.bounds import Variant
 from ..model.predictor import CoefficientPrior
 from ..noise import Gaussian
 from ..noise.base import Noise
@@ -60,7 +60,7 @@ class Problem:
     ordinary: Source | None = None
     # (n,): the group of each row of the source.
     groups: np.ndarray | None = None
-    # How inducing points are placed. The exact model does not use it.
+    # How inducing points are placed.
     placement: Placement = field(default_factory=lambda: Placement("auto", 0))
     solver: Solver = field(default_factory=LBFGS)
     max_iter: int = 0
@@ -69,17 +69,13 @@ class Problem:
     sharing: Sharing = "all"
     # Whether ``sharing`` was found by the fit, and not given.
     found: bool = False
-    family: PosteriorFamily = "full"
-    # Whether the bound is the tight one (see `model.bounds.BoundAtOptimum`).
-    tight: bool = False
+    variant: Variant = field(default_factory=Variant)
     # The folds by which signal and noise are calibrated.
     noise_cv: CrossValidation | None = None
     noise: Noise = field(default_factory=Gaussian)
     # (n, o): noise variances of the rows in units of σ², on top of those in the source. The outputs of a model share
     # their mean.
     row_variance: np.ndarray | None = None
-    # Whether f is orthogonal to the features (see `model.bounds.Group.leaks`).
-    orthogonal: bool = False
     # For independent models, or else for blocks of rows.
     n_threads: int = 1
 
@@ -166,6 +162,11 @@ class Problem:
         return self.shapes[0][-1]
 
     @property
+    def may_be_exact(self) -> bool:
+        """Whether a fit maximises the likelihood if all rows are inducing points."""
+        return not self.noise.heavy_tails and self.rules.lowest_noise_exact is not None
+
+    @property
     def per_output(self) -> bool:
         """Whether each output has its own inputs or features."""
         return max(map(len, self.shapes)) > 1
@@ -183,7 +184,7 @@ class Problem:
                 'sharing="kernel" of outputs with rows of their own needs solver="lbfgs" or an LBFGS(...); got '
                 f"solver={solver!r}."
             )
-        if self.orthogonal and (solver.stochastic or self.family == "diagonal"):
+        if self.variant.orthogonal and (solver.stochastic or self.variant.family == "diagonal"):
             raise ValueError(
                 'discrepancy="orthogonal" needs solver="lbfgs" or an LBFGS(...) with posterior="full"; got '
                 f"solver={solver!r}."
@@ -193,8 +194,8 @@ class Problem:
             return
         if solver.stochastic:
             raise ValueError(f'{told} needs solver="lbfgs" or an LBFGS(...); got solver={solver!r}.')
-        if self.family == "diagonal":
-            raise ValueError(f'{told} needs posterior="full"; got posterior={self.family!r}.')
+        if self.variant.family == "diagonal":
+            raise ValueError(f'{told} needs posterior="full"; got posterior={self.variant.family!r}.')
 
 
 def _prior(

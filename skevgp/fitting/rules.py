@@ -9,6 +9,8 @@ from ..utils.linalg import JITTER, Jitter
 
 # Largest number of floats of a sample. Samples are held in memory.
 LARGEST_SAMPLE = 2_000_000
+# Lowest noise variance in squared target units: about the rounding error of the residuals.
+LOWEST_NOISE = 1e-20
 # Lower limit of the noise in the exact model. Above it, rounding does not matter. A smooth function is met to 1e-6.
 LOWEST_NOISE_EXACT = 1e-12
 

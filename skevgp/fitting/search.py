@@ -65,9 +65,9 @@ def better(best: Fit | None, fit: Fit) -> Fit:
 class FeaturesAlone:
     """The bound of the features without a Gaussian process. A fit that ends below it has failed."""
 
-    bound: float = -np.inf
+    bound: float
     # (o,): the noise variances that reach the bound.
-    noise: np.ndarray | None = None
+    noise: np.ndarray
     # An upper limit of the bound, if it depends on the end of a kernel with a fixed signal.
     most: float = -np.inf
     # Whether the noise may be far above the residuals, so that no fit climbs to it.
@@ -204,7 +204,6 @@ class Search:
         if self._is_doubtful(best):
             # A fit with little signal, from the noise that is best for the features alone.
             noise = self.model.alone.noise
-            assert noise is not None
             little = np.minimum(first["signal"], _LITTLE * noise / self.model.mean_precision)
             self._released(self._fit(Start(first | {"signal": little, "noise": noise}, self.max_iter)))
 
@@ -317,9 +316,10 @@ class Search:
 
     def _is_doubtful(self, best: Fit) -> bool:
         """Whether the best fit is, or may be, below the features alone, and another start could help."""
-        alone, free = self.model.alone, self.table["noise"].free.any() or self.table["signal"].free.any()
-        if alone.noise is None or self.max_iter == 0 or not free or not self.rules.last_start:
+        free = self.table["noise"].free.any() or self.table["signal"].free.any()
+        if self.max_iter == 0 or not free or not self.rules.last_start:
             return False
+        alone = self.model.alone
         maybe_below = best.n_rows is None and best.bound < alone.most - _WORTH
         return maybe_below or self._below(best, hopeless=alone.hidden)
 

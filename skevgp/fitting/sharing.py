@@ -142,7 +142,13 @@ class _ShortFits:
         # Here outputs do not share their weights: only the kernel matters.
         units = replace(problem.units, prior=replace(problem.units.prior, shared=False))
         problem = replace(
-            problem, source=source, ordinary=None, units=units, placement=placement, sharing="all", family="full"
+            problem,
+            source=source,
+            ordinary=None,
+            units=units,
+            placement=placement,
+            sharing="all",
+            variant=replace(problem.variant, family="full"),
         )
         (model,) = models_of(problem, rng, monitor, BlockMap())
         together = _short_fit(model, model.table, _FIRST_ITERATIONS, monitor)

@@ -14,9 +14,8 @@ from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup
 from ..model.statistics import Kernel, Whitening
 from ..utils.linalg import NotPositiveDefiniteError, jittered_cholesky
 from .problem import Problem
+from .rules import LOWEST_NOISE
 
-# Lowest noise variance in squared target units: about the rounding error of the residuals.
-LOWEST_NOISE = 1e-20
 # Limits of the factors of the standard deviations of groups of weights.
 _FACTOR_LIMITS = 1e-4, 1e4
 

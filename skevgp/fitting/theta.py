@@ -68,7 +68,7 @@ _FAR = 3.0
 
 
 class FitOfTheta(Protocol):
-    """The part of `Fitted` and `ExactFit` that is needed here."""
+    """The part of `Fitted` that is needed here."""
 
     @property
     def prior(self) -> CoefficientPrior:
@@ -260,7 +260,7 @@ class _Calibrator:
         self.prior = problem.units.prior
         self.p = self.prior.scale.shape[1]
         # Whether one model has all outputs. (If f is orthogonal, bounds are those of a free f, but steps are not.)
-        self.together = self.prior.shared or problem.orthogonal
+        self.together = self.prior.shared or problem.variant.orthogonal
         self.feature_map = data.maps.feature_map
         self.columns = columns_of(self.feature_map, _sample(data, _SEEN_ROWS)[0], len(theta))
         self.sample, targets = _sample(data, _START_ROWS)
@@ -484,7 +484,7 @@ def calibrate(
     if theta is None:
         return None
     solver, noise = problem.solver, problem.noise
-    if solver.stochastic or problem.family == "diagonal" or noise.heavy_tails or noise.inputs is not None:
+    if solver.stochastic or problem.variant.family == "diagonal" or noise.heavy_tails or noise.inputs is not None:
         raise ValueError(
             f'A feature map with parameters ({", ".join(theta.names)}) needs solver="lbfgs" or an LBFGS(...) with '
             f'posterior="full", and Gaussian noise of y only; got solver={solver!r} and noise={noise!r}.'
@@ -523,7 +523,7 @@ def calibrate(
     at_mode = own.data_at(step.z)
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
-    bend = own.bend(step, fitted) if problem.orthogonal and trusted else None
+    bend = own.bend(step, fitted) if problem.variant.orthogonal and trusted else None
     posterior = ThetaPosterior.of(found, step, own.together, bend)
     if not trusted or _length(step.newton(), step) > _MOVED:
         posterior = replace(posterior, mean=step.z)
@@ -543,6 +543,6 @@ def after_more_rows(
     prior = restricted(fitted.prior, p)
     z = posterior.theta.coordinates()
     step = theta_step(fitted.weight_likelihoods(), prior, linearized.columns, z)
-    together = prior.shared or fitted.models[0].sparse.orthogonal
+    together = prior.shared or fitted.models[0].posterior.sparse.variant.orthogonal
     found = ThetaPosterior.of(posterior.theta, step, together, posterior.bend)
     return found, fitted.reweighted(extended(prior, step))

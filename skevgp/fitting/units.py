@@ -291,9 +291,9 @@ class Units:
         """The prior of the weights in internal units."""
         return self.prior.scaled(1.0 / self.target_unit)
 
-    def log_unit(self, outputs: Columns) -> float:
-        """The difference per row between a loss in the user's units and in internal ones."""
-        return float(np.log(self.target_unit[outputs]).sum())
+    def shift(self, n_contrasts: np.ndarray, outputs: Columns) -> float:
+        """The loss of some outputs in the user's units less that in internal ones. ``n_contrasts`` are (o,)."""
+        return float(n_contrasts @ np.log(self.target_unit[outputs]))
 
     def predictor(self, parts: Sequence[Predictor], outputs: Sequence[list[int]]) -> Predictor:
         """The predictor of all outputs in the user's units, from predictors of some outputs each in internal units."""

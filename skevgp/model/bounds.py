@@ -13,7 +13,7 @@ With P = [s Vᵀ, H C] (n, m + p) and ω = (v, w), the model is r = P ω + ε. T
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -32,6 +32,24 @@ from .predictor import CoefficientPrior
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The variant of a sparse model: it is handed from the estimator to each group of outputs."""
+
+    # The family of q.
+    family: PosteriorFamily = "full"
+    # Whether the bound is the tight one of Titsias (2025), not that of Titsias (2009) (see `BoundAtOptimum`).
+    tight: bool = False
+    # Whether f is orthogonal to the features (see `Group.leaks`). Fits are those of the free f.
+    orthogonal: bool = False
+
+    @property
+    def of_fit(self) -> Variant:
+        """The variant whose bound is maximised."""
+        return replace(self, orthogonal=False)
+
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -52,15 +70,14 @@ class Group:
     prior: CoefficientPrior
     # Whether the inducing points are all rows, so that they explain the whole variance.
     complete: bool = False
-    # Whether the bound is the tight one. ``statistics`` then have the charge at ``signal`` and ``noise``.
-    tight: bool = False
-    # Whether f is orthogonal to the features, summed over the rows of the statistics.
-    orthogonal: bool = False
+    # If the bound is the tight one, ``statistics`` have the charge at ``signal`` and ``noise``. If f is orthogonal to
+    # the features, it is so in the sum over the rows of the statistics.
+    variant: Variant = field(default_factory=Variant)
 
     def charges(self) -> np.ndarray:
         """Twice the nats (o,) that the bound loses for what the points do not explain, and their slopes in log s²."""
         loose = self.signal / self.noise * self.statistics.unexplained
-        return np.broadcast_to(self.statistics.charge if self.tight else loose, (2, len(self.noise)))
+        return np.broadcast_to(self.statistics.charge if self.variant.tight else loose, (2, len(self.noise)))
 
     @cached_property
     def scales(self) -> np.ndarray:
@@ -77,14 +94,14 @@ class Group:
         T = blockdiag(s I, C), or this times [I, 0; -leak, I] if f is orthogonal to the features.
         """
         m = len(self.statistics.VV)
-        if self.orthogonal and not transposed:
+        if self.variant.orthogonal and not transposed:
             A = A.copy()
             A[m:] -= self.leaks[index] @ A[:m]
         found = (self.scales[index] * A.T).T
         if self.prior.root is not None:
             C = self.prior.root[index]
             found[m:] = (C.T if transposed else C) @ A[m:]
-        if self.orthogonal and transposed:
+        if self.variant.orthogonal and transposed:
             found[:m] -= self.leaks[index].T @ found[m:]
         return found
 
@@ -114,7 +131,7 @@ class Group:
         """PᵀP (m + p, m + p) and Pᵀr (m + p,) of an output."""
         statistics, scales = self.statistics, self.scales[index]
         sums = np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
-        if self.prior.root is not None or self.orthogonal:
+        if self.prior.root is not None or self.variant.orthogonal:
             # Tᵀ (Tᵀ J)ᵀ = Tᵀ J T, with J = [V; Hᵀ] [Vᵀ, H].
             TJ = self.times_T(index, statistics.joint, transposed=True)
             return self.times_T(index, TJ.T, transposed=True), self.times_T(index, sums, transposed=True)
@@ -125,7 +142,7 @@ class Group:
     def sizes(self, index: int) -> np.ndarray | None:
         """The diagonal (m + p,) of B of an output if no terms cancelled. None: they do not."""
         # V⊥ V⊥ᵀ is a difference, and so are features times correlated C: rounding errors of V Vᵀ and HᵀH stay.
-        if self.prior.root is None and not self.orthogonal:
+        if self.prior.root is None and not self.variant.orthogonal:
             return None
         of_V = self.signal[index] * diagonal_of(self.statistics.VV)
         of_H = np.square(self.prior.roots()[index]).T @ diagonal_of(self.statistics.HH)
@@ -272,11 +289,10 @@ def diagonal_gap(
 # --- the evidence lower bound -----------------------------------------------------------------------------------------
 
 
-def bounds_at_optimum(groups: Sequence[Group], family: PosteriorFamily) -> list[BoundAtOptimum]:
+def bounds_at_optimum(groups: Sequence[Group]) -> list[BoundAtOptimum]:
     """The lower bound of each group of a model. Groups may share their weights."""
     return [
-        BoundAtOptimum(group, family, posteriors)
-        for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True)
+        BoundAtOptimum(group, posteriors) for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True)
     ]
 
 
@@ -318,7 +334,7 @@ class BoundAtOptimum:
     #
     # If e is summed row by row, as in `statistics.pull_back`, no digits cancel at any signal-to-noise ratio.
 
-    def __init__(self, group: Group, family: PosteriorFamily, posteriors: list[WhitenedPosterior]):
+    def __init__(self, group: Group, posteriors: list[WhitenedPosterior]):
         statistics, scales, noise = group.statistics, group.scales, group.noise
         joint, m = statistics.joint, len(statistics.VV)
         self.group, self.posteriors = group, posteriors
@@ -336,7 +352,7 @@ class BoundAtOptimum:
             log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             spread[o] = -2.0 * np.diagonal(B_bar)[m:]
-            if family == "diagonal":
+            if group.variant.family == "diagonal":
                 spread[o] = 1.0 / np.maximum(np.diagonal(q.B)[m:], 1.0)
                 gap, gap_B_bar, gap_factor_bar = diagonal_gap(q.B, log_det[o], B_bar, group.whitening)
                 log_det[o] += 2.0 * gap
@@ -356,7 +372,7 @@ class BoundAtOptimum:
             self.weights[:m] / noise,
             0.0 if group.complete else unexplained_bar.sum(),
             factor_bar,
-            group.signal / noise if group.tight else None,
+            group.signal / noise if group.variant.tight else None,
         )
         unexplained, unexplained_slope = -0.5 * group.charges()
         # |v|² + |w + w₀|² of each output. Shared weights count once.
@@ -454,10 +470,10 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
             n_repeated = statistics.n_rows + statistics.surplus - len(statistics.VV)
             trace = group.whitening.jitter() * max(n_repeated + 1, 1)
         noise = group.noise + group.signal * trace
-        wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0), tight=False))
+        wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0), variant=Variant()))
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
     # The log likelihood with the noise variance σ² + t, with the determinant for σ².
-    bounds = bounds_at_optimum(wide, "full")
+    bounds = bounds_at_optimum(wide)
     residuals = [bound.residuals(blocks) for bound in bounds]
     total = sum(bound.value(own) for bound, own in zip(bounds, residuals, strict=True))
     total += lost_by_rounding(bounds, residuals)
@@ -479,4 +495,4 @@ def bounds_alone(sums: LinearSums, prior: CoefficientPrior, noise: np.ndarray, t
         statistics = SufficientStatistics(sums.n_rows, *products, float(unexplained), sums.log_variance, sums.surplus)
         whitening = Whitening(None, VV, VV)
         groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), prior.outputs(output)))
-    return np.array([bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full")])
+    return np.array([bound.value(bound.residuals()) for bound in bounds_at_optimum(groups)])

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import lapack
 
-from ..data.rows import RawRows, Rows
+from ..data.rows import RawRows
 from ..utils.linalg import (
     NotPositiveDefiniteError,
     diagonal_of,
@@ -138,6 +138,10 @@ class OutputGivenKernel:
         return np.concatenate([self.errors, self.w]), root
 
 
+# The kernel at the rows, for all outputs or for each, and each output given it.
+OutputsGivenKernel = tuple[list[Any], list[OutputGivenKernel]]
+
+
 @dataclass(frozen=True)
 class ExactModel:
     """Covariance, prior and rows of o outputs: likelihood, gradient and posterior at given parameters."""
@@ -152,6 +156,19 @@ class ExactModel:
     rows: RawRows
     # k̃ of each output, if outputs have inputs of their own.
     kernels: tuple[Kernel, ...] | None = None
+
+    @classmethod
+    def of(cls, sparse: SparseModel, vague: np.ndarray, rows: RawRows) -> ExactModel:
+        """The exact model of the same kernel and weights, of which some are ``vague`` (o, p), for all ``rows``."""
+        kernels = None
+        if sparse.kernels is not None and rows.inputs.ndim == 3:
+            kernels = tuple(sparse.kernels[sparse.group_of(output)] for output in range(len(vague)))
+        return cls(sparse.kernel, sparse.prior, vague, rows, kernels)
+
+    @property
+    def n_contrasts(self) -> np.ndarray:
+        """Number of residuals (o,) whose density the likelihood is: a vague weight uses up one of them."""
+        return n_contrasts(self.rows.total, self.vague, self.prior.shared)
 
     def with_fewer_features(self) -> ExactModel:
         """The model of the same likelihood with at most as many features as rows in each group of weights.
@@ -200,7 +217,7 @@ class ExactModel:
         rows = replace(self.rows, features=features)
         return replace(self, prior=prior, vague=np.zeros((o, width), dtype=bool), rows=rows)
 
-    def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
+    def outputs(self, values: Values) -> OutputsGivenKernel:
         """The kernel at the rows, for all outputs or for each, and each output given it."""
         hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
         prior = self.prior.at(values)
@@ -228,13 +245,14 @@ class ExactModel:
             OutputGivenKernel.join(together)
         return covariances, outputs
 
-    def log_likelihoods(self, values: Values) -> np.ndarray:
+    def log_likelihoods(self, values: Values, outputs: OutputsGivenKernel | None = None) -> np.ndarray:
         """The log likelihood (o,) of each output, in nats, or -inf if it cannot be computed.
 
-        Shared weights count for the first output.
+        Shared weights count for the first output. ``outputs`` are computed if they are None.
         """
         try:
-            return np.array([output.log_likelihood for output in self.outputs(values)[1]]) + self._of_copies(values)
+            _, given_kernel = self.outputs(values) if outputs is None else outputs
+            return np.array([output.log_likelihood for output in given_kernel]) + self._of_copies(values)
         except NotPositiveDefiniteError:
             return np.full(len(self.vague), -np.inf)
 
@@ -275,11 +293,11 @@ class ExactModel:
             found.append(likelihood_of_whitened(root_inv @ rows.features, root_inv @ rows.targets[:, 0]))
         return found
 
-    def predictor(self, values: Values) -> Predictor:
-        """The predictor in internal units. Its inducing points are the rows."""
-        covariances, outputs = self.outputs(values)
+    def predictor(self, values: Values, outputs: OutputsGivenKernel | None = None) -> Predictor:
+        """The predictor in internal units. Its inducing points are the rows. ``outputs`` are computed if None."""
+        covariances, given_kernel = self.outputs(values) if outputs is None else outputs
         groups = []
-        for index, output in enumerate(outputs):
+        for index, output in enumerate(given_kernel):
             own, (mean, root) = slice(index, index + 1), output.posterior()
             groups.append(
                 PredictorGroup.of(
@@ -298,13 +316,11 @@ class ExactModel:
         return Predictor(tuple(groups), values["noise"], offset, np.zeros(len(groups)), self.prior.shared)
 
 
-def exact_twin(sparse: SparseModel, table: ParameterTable, rows: Rows) -> ExactModel:
-    """The exact model of the same rows as a sparse model."""
-    kernels, no_vague = None, np.zeros(sparse.prior.scale.shape, dtype=bool)
-    if sparse.kernels is not None:
-        sets = [sparse.set_of(o, table["inducing_points"]) for o in range(len(sparse.prior.scale))]
-        kernels = tuple(sparse.kernels[group] for group in sets)
-    return ExactModel(sparse.kernel, sparse.prior, no_vague, rows.some(np.arange(len(rows))), kernels)
+def n_contrasts(n_rows: float, vague: np.ndarray, shared: bool) -> np.ndarray:
+    """Number of contrasts (o,) of rows, of which each weight that is vague (o, p) uses up one (see the top)."""
+    used = vague.sum(axis=1)
+    # Shared weights count for the first output.
+    return n_rows - (np.where(np.arange(len(used)) == 0, used, 0) if shared else used)
 
 
 class LikelihoodObjective:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ..data.rows import Rows
 from ..utils.linalg import JITTER, Jitter
 from .bounds import (
     Group,
-    PosteriorFamily,
+    Variant,
     WhitenedPosterior,
     bounds_at_optimum,
     diagonal_root,
@@ -32,7 +32,7 @@ _REFINABLE = 0.1
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Covariance, prior of the weights and family of q for o outputs.
+    """Covariance, prior of the weights and variant for o outputs.
 
     The parameters (`Values`) are ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``. Each method that
     takes ``whitenings`` computes them if they are None.
@@ -41,9 +41,9 @@ class SparseModel:
     # k̃, of unit signal variance.
     kernel: Kernel
     prior: CoefficientPrior
-    family: PosteriorFamily
     # The outputs of each set of inducing points.
     groups: tuple[slice, ...]
+    variant: Variant = field(default_factory=Variant)
     # Jitter of k(X_m, X_m).
     jitter: Jitter = JITTER
     # Whether the inducing points are all rows. The bound is then the likelihood, and k(x, x) - |v|² is rounding error.
@@ -51,11 +51,6 @@ class SparseModel:
     # The kernel of each group, if groups have inputs of their own or are joined by their weights only. All have the
     # same hyperparameters (n_hyper,), or each its own row of (g, n_hyper).
     kernels: tuple[Kernel, ...] | None = None
-    # Whether the bound is the tight one of Titsias (2025), not that of Titsias (2009).
-    tight: bool = False
-    # Whether the posterior is that of an f which is orthogonal to the features (see `bounds.Group.leaks`). Bounds and
-    # their gradients are those of the free f.
-    orthogonal: bool = False
 
     def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
         """k̃ of a group, and its hyperparameters (n_hyper,)."""
@@ -63,11 +58,13 @@ class SparseModel:
         own = hyperparameters if hyperparameters.ndim == 1 else hyperparameters[group]
         return self.kernel if self.kernels is None else self.kernels[group], own
 
+    def group_of(self, output: int) -> int:
+        """Index of the group of an output."""
+        return next(i for i, group in enumerate(self.groups) if group.start <= output < group.stop)
+
     def set_of(self, output: int, parameter: Parameter) -> int:
         """Index of the row of a parameter that belongs to an output: that of its group, or 0 if all share one."""
-        if parameter.start.ndim == 1:
-            return 0
-        return next(i for i, group in enumerate(self.groups) if group.start <= output < group.stop)
+        return 0 if parameter.start.ndim == 1 else self.group_of(output)
 
     def blocks(self, rows: Rows, n_inducing: int) -> Blocks:
         """Rows as blocks for this model's kernels."""
@@ -101,7 +98,7 @@ class SparseModel:
 
     def _ratio(self, values: Values, outputs: slice) -> np.ndarray | None:
         """s²/σ² (o,) of a group, for the tight bound."""
-        return values["signal"][outputs] / values["noise"][outputs] if self.tight else None
+        return values["signal"][outputs] / values["noise"][outputs] if self.variant.tight else None
 
     def group(self, values: Values, outputs: slice, whitening: Whitening, statistics: SufficientStatistics) -> Group:
         """The group of one set of inducing points."""
@@ -109,7 +106,7 @@ class SparseModel:
         if self.complete:
             statistics = replace(statistics, unexplained=0.0, charge=0.0)
         prior = self.prior.at(values).outputs(outputs)
-        return Group(outputs, whitening, statistics, signal, noise, prior, self.complete, self.tight)
+        return Group(outputs, whitening, statistics, signal, noise, prior, self.complete, self.variant.of_fit)
 
     def groups_of(
         self,
@@ -133,7 +130,7 @@ class SparseModel:
 
     def bound(self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None) -> float:
         """The lower bound with q at its optimum. Without ``blocks``, digits cancel if there is little noise."""
-        bounds = bounds_at_optimum(self.groups_of(values, statistics), self.family)
+        bounds = bounds_at_optimum(self.groups_of(values, statistics))
         return sum(bound.value(bound.residuals(blocks)) for bound in bounds)
 
     def upper_bound(
@@ -155,20 +152,21 @@ class SparseModel:
         """
         groups, mean, root = self.groups_of(values, statistics, whitenings), [], []
         leaks: list[np.ndarray] | None = None
-        if self.orthogonal:
-            groups = [replace(group, orthogonal=True) for group in groups]
+        if self.variant.orthogonal:
+            groups = [replace(group, variant=self.variant) for group in groups]
             leaks = [leak for group in groups for leak in group.leaks]
         for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
             L_inv = group.whitening.L_inv
             for q in posteriors if blocks is None or self.prior.shared else _refined(group, posteriors, blocks):
                 mean.append(q.mean)
-                root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
+                is_full = self.variant.family == "full"
+                root.append(q.root_inv if is_full else diagonal_root(*log_variances(q.B, L_inv), L_inv))
         return self.predictor(values, [group.whitening for group in groups], mean, root, leaks)
 
     def weight_likelihoods(self, values: Values, statistics: Sequence[SufficientStatistics]) -> list[WeightLikelihood]:
         """The likelihood of the weights of each output, with f integrated out."""
-        groups = self.groups_of(values, statistics)
-        return [own for group in groups for own in weight_likelihoods(replace(group, orthogonal=self.orthogonal))]
+        groups = [replace(group, variant=self.variant) for group in self.groups_of(values, statistics)]
+        return [likelihood for group in groups for likelihood in weight_likelihoods(group)]
 
     def predictor(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -56,11 +55,10 @@ class BoundObjective:
 
     def __init__(self, model: SparseModel, table: ParameterTable, blocks: Blocks):
         self.model, self.table, self.blocks = model, table, blocks
-        self._terms_of = partial(bounds_at_optimum, family=model.family)
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
         values = self.table.values(flat)
-        bound, gradient = evaluate(self.model, values, self.blocks, self._terms_of)
+        bound, gradient = evaluate(self.model, values, self.blocks, bounds_at_optimum)
         bound += log_prior(values, gradient)
         n_rows = self.blocks.linear.n_rows
         return -bound / n_rows, -self.table.gradient(gradient) / n_rows
@@ -92,7 +90,7 @@ class ElboObjective:
         if self.natural is not None:
             self.family = self.natural
         else:
-            self.family = FullFamily(optima) if model.family == "full" else DiagonalFamily(optima, factors)
+            self.family = FullFamily(optima) if model.variant.family == "full" else DiagonalFamily(optima, factors)
         # A step of w should change predictions as much as a step of v.
         reach = model.prior.scale * np.sqrt(np.diagonal(blocks.linear.HH[0]) / self.n_rows)
         m = start["inducing_points"].shape[1]
@@ -174,7 +172,7 @@ class ElboTerms:
             -f / group.noise,
             0.0 if group.complete else 0.5 * self._ratio.sum(),
             self._spread.factor,
-            share * self._ratio if group.tight else None,
+            share * self._ratio if group.variant.tight else None,
         )
 
     def finish(self, residuals: Residuals) -> tuple[float, Values]:
@@ -184,7 +182,7 @@ class ElboTerms:
         shift = self._mean.copy()
         shift[:, m:] += group.prior.reference
         # Rows count N/n times. The bound of Titsias (2009) has that factor in the noise already.
-        unexplained, slope = group.charges() / (self._share if group.tight else 1.0)
+        unexplained, slope = group.charges() / (self._share if group.variant.tight else 1.0)
         data = residuals.squares / group.noise
         loss = 0.5 * float((data + unexplained).sum() + np.vdot(shift, shift) - shift.size) + spread.value
         from_mean = 0.5 * np.einsum("mo,mo->o", f, residuals.VE) / group.noise

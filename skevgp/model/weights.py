@@ -54,7 +54,7 @@ def weight_likelihoods(group: Group) -> list[WeightLikelihood]:
         crossed = np.hstack([statistics.VH, statistics.VR[:, [o]]])
         VV = statistics.VV
         of_V = 1.0 + signal / noise * diagonal_of(VV)
-        if group.orthogonal:
+        if group.variant.orthogonal:
             VV, crossed = group.orthogonalised(o, crossed, linear[:-1])
         D = VV * (signal / noise)
         diagonal_of(D)[...] += 1.0

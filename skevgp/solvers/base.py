@@ -56,6 +56,7 @@ class Solver(StatefulEstimator):
 
     default_max_iter: ClassVar[int]  # for max_iter=None
     stochastic: ClassVar[bool] = False  # whether it takes mini-batches of the rows
+    takes_widest_limits: ClassVar[bool] = False  # whether it gets the widest limits of signal and noise at once
 
     n_restarts: int
     callback: Callback | None

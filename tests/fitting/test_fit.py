@@ -102,8 +102,8 @@ def test_calibrated_are_signal_and_noise_and_q_is_at_its_optimum_for_them():
         assert (done.values[name] != found.values[name]).all()
     for name in ("hyperparameters", "inducing_points"):
         np.testing.assert_array_equal(done.values[name], found.values[name])
-    predictor = model.sparse.at_optimum(done.values, done.statistics, blocks=model.blocks)
-    assert done.bound == model.sparse.bound(done.values, done.statistics, model.blocks)
+    predictor = model.sparse.at_optimum(done.values, done.posterior.statistics, blocks=model.blocks)
+    assert done.bound == model.sparse.bound(done.values, done.posterior.statistics, model.blocks)
     np.testing.assert_array_equal(done.predictor.groups[0].mean, predictor.groups[0].mean)
 
 

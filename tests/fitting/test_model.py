@@ -7,7 +7,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
 from skevgp.fitting.model import partition_of
 from skevgp.fitting.search import FeaturesAlone
-from skevgp.model.bounds import bounds_alone
+from skevgp.model.bounds import Variant, bounds_alone
 from skevgp.solvers import LBFGS, Adam
 from skevgp.utils.monitor import Monitor
 
@@ -115,7 +115,7 @@ TWICE = {"X": np.vstack([X, X * (1.0 + 1e-15)]), "H": np.vstack([H, H]), "Y": np
         ({**TWICE, "n_inducing": N}, True),
         ({**TWICE, "placement": Placement(X[::-1], N)}, True),
         ({"n_inducing": N - 1}, False),
-        ({"n_inducing": N, "family": "diagonal"}, False),
+        ({"n_inducing": N, "variant": Variant("diagonal")}, False),
         ({"placement": Placement(X[1:], N - 1)}, False),
         ({"placement": Placement(X + 1e-3, N)}, False),
         (MANY, False),

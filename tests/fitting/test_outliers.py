@@ -7,6 +7,7 @@ from skevgp.fitting import outliers
 from skevgp.fitting.doubts import Look, RowDoubts, look_at
 from skevgp.fitting.outliers import settle
 from skevgp.fitting.search import Start, better
+from skevgp.model.bounds import Variant
 from skevgp.noise import StudentT
 from skevgp.noise.student_t import StudentTScales
 
@@ -22,7 +23,7 @@ def wrong_at_three(**changes):
     return model_of(**data_of(wrong), **changes, noise=StudentT())
 
 
-@pytest.mark.parametrize("changes", [{}, {"family": "diagonal"}, {"sharing": "kernel"}], ids=str)
+@pytest.mark.parametrize("changes", [{}, {"variant": Variant("diagonal")}, {"sharing": "kernel"}], ids=str)
 def test_no_turn_lowers_the_bound(changes):
     model = wrong_at_three(max_iter=10, **changes)
     rows = model.rows

@@ -41,7 +41,7 @@ def model(**changes):
         "restart": table().values_at_start,
         "scatter": np.ones(2),
         "mean_precision": 1.0,
-        "alone": FeaturesAlone(),
+        "alone": FeaturesAlone(-np.inf, np.ones(2)),
         "interpolates": False,
         "samples": (),
         "lengthscale_mask": np.array([True, False]),
@@ -128,7 +128,7 @@ def test_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
 
 
 def test_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
-    below = {"alone": FeaturesAlone(6.0)}
+    below = {"alone": FeaturesAlone(6.0, np.ones(2))}
     assert len(drive(model(**below), (5.0, GOOD), (8.0, GOOD))[0]) == 2
     assert len(drive(model(**below), (5.0, UNFINISHED))[0]) == 1
 

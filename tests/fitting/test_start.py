@@ -76,7 +76,7 @@ def test_predictions_are_of_y():
     parts = []
     for o in range(2):
         own = slice(o, o + 1)
-        model = SparseModel(kernel, prior.outputs(own), "full", (slice(0, 1),))
+        model = SparseModel(kernel, prior.outputs(own), (slice(0, 1),))
         values = {
             "hyperparameters": np.ones(2),
             "signal": np.ones(1),

@@ -36,7 +36,7 @@ def model_with(kernel, shared=True, **sizes):
     variance = checked_variance(covariance, spec.starts.hyperparameters.value, points[0])
     size = covariance.n_hyperparameters
     table = table_of(rows.inputs, points, starts, np.ones(2), size, mean_variance=variance)
-    return SparseModel(covariance, model.prior, "full", model.groups), rows, table
+    return SparseModel(covariance, model.prior, model.groups), rows, table
 
 
 def test_value_of_a_bound_that_depends_on_the_diagonal():

@@ -44,13 +44,13 @@ FAMILIES = ("full", "diagonal")
 
 def plain_loss(model, rows, table):
     """The loss per row as plain autograd of the flat vector."""
-    dense = Dense(rows.raw, model.prior, model.family)
+    dense = Dense(rows.raw, model.prior, model.variant.family)
     return lambda flat: -dense.bound(values_of(table, flat)) / len(rows)
 
 
 def test_gradient_with_one_lengthscale_for_all_columns():
     model, rows, table = problem()
-    model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
+    model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, model.groups)
     starts, points = Starts(Start(), Start(), Start()), table["inducing_points"].start
     table = table_of(rows.inputs, points, starts, np.ones(2), 1, Rules(0.1))
     loss = plain_loss(model, rows, table)
@@ -86,7 +86,7 @@ def test_squares_from_statistics_are_never_negative_whatever_rounding_says():
         model, rows, table = problem(seed=seed)
         rows.residuals[:] = rows.features @ np.full((3, 2), 30.0)
         values = table.values_at_start() | {"noise": np.full(2, 1e-10)}
-        (bound,) = bounds_at_optimum(list(model.groups_on(values, rows.blocks(model.kernel, 17))), "full")
+        (bound,) = bounds_at_optimum(list(model.groups_on(values, rows.blocks(model.kernel, 17))))
         found.append(bound.residuals().squares)
     assert np.min(found) >= 0.0
     assert np.max(found) < 1e-6
@@ -187,7 +187,7 @@ def on_rows(copies=1, n=30, p=3):
     model, rows, table = problem(n=n, m=2, d=3, p=p)
     points = rows.inputs
     rows = type(rows)(*(np.repeat(own, copies, axis=0) for own in (points, rows.features, rows.residuals)))
-    model = SparseModel(model.kernel, model.prior, "full", model.groups, complete=True)
+    model = SparseModel(model.kernel, model.prior, model.groups, complete=True)
     return model, rows, table.values_at_start() | {"inducing_points": points[np.newaxis]}
 
 
@@ -290,13 +290,13 @@ def test_loss_of_suboptimal_mean_is_known(weights_are_shared, from_rows):
     model = replace(model, prior=replace(model.prior, shared=weights_are_shared, **alike))
     values, blocks = table.values_at_start(), rows.blocks(model.kernel, 17)
     groups = model.groups_of(values, model.statistics(values, blocks))
-    best = sum(bound.value(bound.residuals(blocks)) for bound in bounds_at_optimum(groups, "full"))
+    best = sum(bound.value(bound.residuals(blocks)) for bound in bounds_at_optimum(groups))
     rng, bounds = np.random.RandomState(0), []
     off_w = 0.1 * rng.randn(model.prior.scale.shape[1])
     for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
         offs = [np.concatenate([0.1 * rng.randn(len(q.mean) - len(off_w)), off_w]) for q in posteriors]
         moved = [replace(q, mean=q.mean + off) for q, off in zip(posteriors, offs, strict=True)]
-        bounds.append(BoundAtOptimum(group, "full", moved))
+        bounds.append(BoundAtOptimum(group, moved))
         if not weights_are_shared:
             rest = equation_errors(group, moved, bounds[-1].residuals(blocks))
             for q, off, found in zip(moved, offs, rest, strict=True):
@@ -315,10 +315,10 @@ def test_upper_bound_corrects_suboptimal_mean(monkeypatch):
     groups = model.groups_of(values, model.statistics(values, blocks))
     expected = upper_bound(groups, blocks)
 
-    def moved(groups, family):
+    def moved(groups):
         posteriors = optimal_posteriors(groups)
         return [
-            BoundAtOptimum(group, family, [replace(q, mean=q.mean + 0.1) for q in own])
+            BoundAtOptimum(group, [replace(q, mean=q.mean + 0.1) for q in own])
             for group, own in zip(groups, posteriors, strict=True)
         ]
 

@@ -9,6 +9,7 @@ import pytest
 from autograd import grad
 from numpy.testing import assert_allclose
 
+from skevgp.model.bounds import Variant
 from skevgp.model.exact import ExactModel
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective, ElboObjective
@@ -68,7 +69,7 @@ def assert_predictions(predictor, dense, values, p):
 @pytest.mark.parametrize(("family", "tight", "n_groups", "shared", "weighted", "p"), SPARSE)
 def test_sparse_model_is_dense_one(family, tight, n_groups, shared, weighted, p):
     model, raw, table = setting(family, n_groups, shared, weighted, p)
-    model, dense = replace(model, tight=tight), Dense(raw, model.prior, family, tight=tight)
+    model, dense = replace(model, variant=Variant(family, tight)), Dense(raw, model.prior, family, tight=tight)
     values, blocks = table.values_at_start(), blocks_of(raw, model.kernel)
     statistics = model.statistics(values, blocks)
     lower, likelihood, of_factors = dense.bound(values), dense.likelihood(values), log_prior(values)
@@ -77,7 +78,7 @@ def test_sparse_model_is_dense_one(family, tight, n_groups, shared, weighted, p)
     assert model.bound(values, statistics) == pytest.approx(lower, rel=1e-8)
     assert lower < likelihood < model.upper_bound(values, statistics, blocks)
     if tight:
-        loose = replace(model, tight=False)
+        loose = replace(model, variant=Variant(family))
         assert loose.bound(values, loose.statistics(values, blocks), blocks) < lower
     if not weighted and not shared:
         for seen in (blocks, None):
@@ -123,7 +124,7 @@ def test_points_at_all_rows_give_exact_model(p, weighted):
     model, rows, table = problem(n=30, m=2, d=3, p=p)
     raw = replace(rows.raw, counts=np.full(30, 3.0), precision=np.linspace(1.0, 5.0, 30)) if weighted else rows.raw
     values = table.values_at_start() | {"inducing_points": raw.inputs[np.newaxis]}
-    model = SparseModel(model.kernel, model.prior, "full", model.groups, complete=True)
+    model = SparseModel(model.kernel, model.prior, model.groups, complete=True)
     blocks = blocks_of(raw, model.kernel)
     statistics, expected = model.statistics(values, blocks), Dense(raw, model.prior, exact=True).likelihood(values)
     assert model.bound(values, statistics, blocks) == pytest.approx(expected, rel=1e-6)

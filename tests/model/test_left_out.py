@@ -38,7 +38,7 @@ def refitted(model, values, rows, outputs, signal, noise, out, counts=None, rela
     mean_before = np.append(np.zeros(total - p), -prior.reference[o])
     mean = solve_triangular(R, Q.T @ np.concatenate([*targets, mean_before]))
     design, V = designs[0][out], Ls[0][1][:, out]
-    if model.family == "full":
+    if model.variant.family == "full":
         latent = np.sum(solve_triangular(R, design.T, trans=1) ** 2, axis=0)
     else:
         # Diagonal in the coordinates (f_m, w) of the output, whatever is not known of other outputs.

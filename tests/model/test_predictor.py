@@ -76,7 +76,7 @@ def test_novelty_where_f_is_known_without_data():
     """A linear function is 0 at the origin; elsewhere its prior variance is |x|² s²."""
     model, _, table = problem(d=1, m=1, p=0)
     values = table.values_at_start() | {"hyperparameters": np.array([1e-170]), "inducing_points": np.array([[[2.0]]])}
-    model = SparseModel(DotProduct(), model.prior, "full", model.groups)
+    model = SparseModel(DotProduct(), model.prior, model.groups)
     predictor = model.predictor(values, list(model.whitenings(values)), [np.ones(1)] * O, [np.full((1, 1), 0.5)] * O)
     inputs = np.array([[0.0], [1e-3], [2.0], [-30.0]])
     expected = np.repeat([[0.0], [0.25], [0.25], [0.25]], O, axis=1)
@@ -126,7 +126,7 @@ def test_predictors_of_single_outputs_are_joined_each_to_its_own(order):
     parts = []
     for o in range(O):
         own = slice(o, o + 1)
-        alone = SparseModel(model.kernel, model.prior.outputs(own), "full", (slice(0, 1),))
+        alone = SparseModel(model.kernel, model.prior.outputs(own), (slice(0, 1),))
         of_output = {name: value[own] for name, value in values.items() if name != "hyperparameters"}
         of_output["hyperparameters"] = values["hyperparameters"]
         parts.append(alone.predictor(of_output, list(alone.whitenings(of_output)), mean[own], root[own]))

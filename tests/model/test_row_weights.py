@@ -56,7 +56,7 @@ def test_upper_bound_holds_with_jitter_and_weights(counts):
     rows.inputs[1] = rows.inputs[0] + 1e-9
     values = table.values_at_start() | {"inducing_points": rows.inputs[np.newaxis]}
     raw = weighted(rows, counts)
-    model = SparseModel(model.kernel, model.prior, "full", model.groups, complete=True)
+    model = SparseModel(model.kernel, model.prior, model.groups, complete=True)
     (group,) = model.groups_on(values, blocks_of(raw, model.kernel))
     assert group.whitening.jitter() > 0.0
     likelihood = Dense(raw, model.prior).likelihood(values)

@@ -1,0 +1,205 @@
+"""The posterior at the end of a fit. `SparsePosterior` and `ExactPosterior` have the same methods.
+
+A new approximation is another class with these: ``bound``, ``upper_bound``, ``predictor``, ``n_contrasts``,
+`weight_likelihoods`, `moved` and `updated`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ..data.blocks import Blocks
+from ..data.rows import Rows
+from .exact import ExactModel
+from .model import SparseModel
+from .parameters import Values
+from .predictor import CoefficientPrior, Predictor
+from .statistics import SufficientStatistics, Whitening
+from .weights import WeightLikelihood
+
+
+class FromRows(NamedTuple):
+    """What a pass over the rows computes without cancellation."""
+
+    bound: float
+    upper_bound: float
+    predictor: Predictor
+
+
+@dataclass(frozen=True)
+class SparsePosterior:
+    """A sparse model at the end of a fit. It keeps sums over the rows, and no rows."""
+
+    sparse: SparseModel
+    values: Values
+    # For each set of inducing points, at ``values``.
+    statistics: list[SufficientStatistics]
+    # None: the statistics give the same. Digits then cancel if there is little noise.
+    from_rows: FromRows | None = None
+    # The whitening of each set of inducing points. None: it is computed.
+    known_whitenings: tuple[Whitening, ...] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        sparse: SparseModel,
+        values: Values,
+        blocks: Blocks,
+        statistics: list[SufficientStatistics] | None = None,
+    ) -> SparsePosterior:
+        """The posterior with q at its optimum for all rows. ``statistics`` are computed if they are None."""
+        if statistics is None:
+            statistics = sparse.statistics(values, blocks)
+        from_rows = FromRows(
+            sparse.bound(values, statistics, blocks),
+            sparse.upper_bound(values, statistics, blocks),
+            sparse.at_optimum(values, statistics, blocks=blocks),
+        )
+        return cls(sparse, values, statistics, from_rows)
+
+    def with_q(self, predictor: Predictor, bound: float) -> SparsePosterior:
+        """The posterior with a q that is not at its optimum, and its bound."""
+        return replace(self, from_rows=FromRows(bound, self.upper_bound, predictor))
+
+    # --- what every posterior has -------------------------------------------------------------------------------------
+
+    @cached_property
+    def bound(self) -> float:
+        """Lower bound on the log marginal likelihood of the residuals, in nats, in internal units."""
+        return self.sparse.bound(self.values, self.statistics) if self.from_rows is None else self.from_rows.bound
+
+    @cached_property
+    def upper_bound(self) -> float:
+        """Upper bound on the same."""
+        if self.from_rows is None:
+            return self.sparse.upper_bound(self.values, self.statistics)
+        return self.from_rows.upper_bound
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """The predictor of residuals, in internal units."""
+        if self.from_rows is None:
+            return self.sparse.at_optimum(self.values, self.statistics, self.known_whitenings)
+        return self.from_rows.predictor
+
+    @property
+    def n_contrasts(self) -> np.ndarray:
+        """Number of residuals (o,) whose density the bound is about."""
+        return np.full(len(self.values["noise"]), self.statistics[0].n_rows)
+
+    def weight_likelihoods(
+        self, prior: CoefficientPrior | None = None, rows: Rows | None = None
+    ) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output: under another prior, or for ``rows`` with other features."""
+        sparse = self.sparse if prior is None else replace(self.sparse, prior=prior)
+        statistics = self.statistics if rows is None else sparse.statistics(self.values, self._blocks(sparse, rows))
+        return sparse.weight_likelihoods(self.values, statistics)
+
+    def moved(self, prior: CoefficientPrior, rows: Rows) -> SparsePosterior:
+        """The posterior for other features of the same rows, at the same values."""
+        sparse = replace(self.sparse, prior=prior)
+        return SparsePosterior.of(sparse, self.values, self._blocks(sparse, rows))
+
+    def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
+        """The posterior with new rows: q is at its optimum for all of them.
+
+        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is that of a sparse model.
+        """
+        # Points that were all rows before are not all rows now.
+        sparse, before = replace(self.sparse, complete=False), self.statistics
+        whitenings = self.known_whitenings
+        if whitenings is None:
+            whitenings = tuple(group.whitening for group in self.predictor.groups)
+        if weight < 1.0:
+            # The tight charge of earlier rows with another weight is not known from their sums.
+            before = sparse.with_loose_charge(self.values, before)
+        new = sparse.statistics(self.values, self._blocks(sparse, rows), whitenings)
+        sums = [old.scaled(weight) + more for old, more in zip(before, new, strict=True)]
+        return SparsePosterior(sparse, self.values, sums, known_whitenings=whitenings)
+
+    # --- after rows were added ----------------------------------------------------------------------------------------
+
+    def reweighted(self, prior: CoefficientPrior) -> SparsePosterior:
+        """The posterior for another prior of the weights that has the same offset."""
+        return replace(self, sparse=replace(self.sparse, prior=prior), from_rows=None)
+
+    def _blocks(self, sparse: SparseModel, rows: Rows) -> Blocks:
+        return sparse.blocks(rows, self.values["inducing_points"].shape[1])
+
+
+@dataclass(frozen=True)
+class ExactPosterior:
+    """An exact model at the end of a fit, with its rows."""
+
+    # The same model with all rows as inducing points: for new rows, and for an f that is orthogonal to the features.
+    sparse: SparseModel
+    exact: ExactModel
+    values: Values
+    bound: float
+    predictor: Predictor
+
+    @classmethod
+    def of(cls, sparse: SparseModel, exact: ExactModel, values: Values) -> ExactPosterior:
+        """The posterior at some values."""
+        outputs = exact.outputs(values)
+        bound = float(exact.log_likelihoods(values, outputs).sum())
+        if sparse.variant.orthogonal:
+            blocks = _blocks_of(sparse, exact, values)
+            predictor = sparse.at_optimum(values, sparse.statistics(values, blocks), blocks=blocks)
+        else:
+            predictor = exact.predictor(values, outputs)
+        return cls(sparse, exact, values, bound, predictor)
+
+    @property
+    def upper_bound(self) -> float:
+        """The bound, which is the log marginal likelihood."""
+        return self.bound
+
+    @property
+    def n_contrasts(self) -> np.ndarray:
+        """Number of residuals (o,) whose density the bound is about."""
+        return self.exact.n_contrasts
+
+    def weight_likelihoods(
+        self, prior: CoefficientPrior | None = None, rows: Rows | None = None
+    ) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, as of `SparsePosterior`."""
+        sparse, exact = self.sparse, self.exact
+        if prior is not None and rows is not None:
+            sparse, exact = self._with(prior, rows)
+        if sparse.variant.orthogonal:
+            return sparse.weight_likelihoods(
+                self.values, sparse.statistics(self.values, _blocks_of(sparse, exact, self.values))
+            )
+        return exact.weight_likelihoods(self.values)
+
+    def moved(self, prior: CoefficientPrior, rows: Rows) -> ExactPosterior:
+        """The posterior for other features of the same rows, at the same values."""
+        return ExactPosterior.of(*self._with(prior, rows), self.values)
+
+    def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
+        """The posterior of the sparse model with new rows, as of `SparsePosterior`."""
+        values = self.values | {"noise": np.maximum(self.values["noise"], lowest_noise)}
+        blocks, whitenings = _blocks_of(self.sparse, self.exact, values), tuple(self.sparse.whitenings(values))
+        statistics = self.sparse.statistics(values, blocks, whitenings)
+        before = SparsePosterior(self.sparse, values, statistics, known_whitenings=whitenings)
+        return before.updated(rows, weight, lowest_noise)
+
+    def _with(self, prior: CoefficientPrior, rows: Rows) -> tuple[SparseModel, ExactModel]:
+        # Features that are new have weights with a proper prior.
+        vague = np.zeros(prior.scale.shape, dtype=bool)
+        vague[:, : self.exact.vague.shape[1]] = self.exact.vague
+        exact = replace(self.exact, prior=prior, vague=vague, rows=rows.some(np.arange(len(rows))))
+        return replace(self.sparse, prior=prior), exact
+
+
+Posterior = SparsePosterior | ExactPosterior
+
+
+def _blocks_of(sparse: SparseModel, exact: ExactModel, values: Values) -> Blocks:
+    """The rows of an exact model as blocks for its sparse twin."""
+    return sparse.blocks(Rows.in_internal_units(exact.rows), values["inducing_points"].shape[1])
