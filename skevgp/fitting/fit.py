@@ -17,8 +17,9 @@ from .fitted import Fitted, FittedModel
 from .folds import CrossValidation
 from .grown import grown
 from .messages import interrupted, many_outliers, signal_gone
-from .model import Model, models_of, parts_of
+from .model import Model
 from .outliers import fit_doubting
+from .parts import models_of, parts_of
 from .problem import Problem
 from .search import Fit, search
 from .sharing import with_groups

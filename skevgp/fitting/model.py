@@ -1,21 +1,18 @@
-"""The independent models of a problem: which outputs each has, its rows, its starts, and one run of the solver."""
+"""`Model`: some outputs that are fitted together, with their rows and parameters. It runs the solver from a start."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import chain, pairwise, starmap
-from operator import index
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..data.blocks import Blocks
 from ..data.rows import Rows, of_outputs
-from ..data.threads import BlockMap
 from ..model.bounds import bounds_alone
-from ..model.exact import ExactModel, LikelihoodObjective, n_contrasts
+from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
@@ -25,19 +22,15 @@ from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .alone import best_by_likelihood, best_by_sums, features_alone, noise_left_over
-from .fitted import Fitted
-from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
+from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .messages import ended_early, far_from_prior, learned_too_little, mini_batches_ended
-from .problem import Problem, Sharing
+from .problem import Problem
 from .rules import Rules
 from .search import FeaturesAlone, Fit, Start, drawn
-from .start import centred_kernels, checked_variance, starting_table
-from .units import check_independent, may_hide_noise
+from .units import may_hide_noise
 
 # Factor by which the number of inducing points grows.
 _GROWTH = 1.5
-# The kernel of a user is checked at so many points.
-_CHECKED_POINTS = 500
 # For a higher ratio of signal to noise variance, the exact predictor is used for duplicate rows too.
 _HIGH_RATIO = 1e9
 # The tolerance of L-BFGS, in nats: this, or this share of the gain over features and noise alone if that is more.
@@ -48,148 +41,6 @@ _FLAT, _FLAT_PER_ROW = 0.1, 0.005
 _BOUND_ROUNDING = 1e-8
 # Length of the natural gradient steps of q: the first, and the smallest.
 _NATURAL_RATES = 0.3, 0.02
-
-
-class Part(NamedTuple):
-    """Outputs that are fitted together."""
-
-    outputs: list[int]
-    # Slices of ``outputs``, one for each set of inducing points.
-    groups: tuple[slice, ...]
-    # Whether rows are split by groups, because groups share weights or have their own inputs.
-    split: bool = False
-    # Whether groups have their own kernels.
-    separate: bool = False
-
-
-def parts_of(problem: Problem) -> list[Part]:
-    """The outputs of each independent model. There is one model if outputs share their weights."""
-    sharing, shared, per_output = problem.sharing, problem.units.prior.shared, problem.per_output
-    partition = partition_of(sharing, problem.n_outputs)
-    everything = sorted(chain(*partition))
-    if isinstance(sharing, str) and sharing == "kernel":
-        return [Part(everything, tuple(slice(o, o + 1) for o in everything), split=shared or per_output)]
-    if per_output and max(map(len, partition)) > 1:
-        raise ValueError(
-            f"sharing={sharing!r} joins outputs by their inducing points, but kernel_map or feature_map returns a row "
-            "for each output: use 'none', or 'kernel' for outputs with the same kernel."
-        )
-    if not shared or len(partition) == 1:
-        return [Part(own, (slice(0, len(own)),)) for own in partition]
-    ends = np.cumsum([0, *map(len, partition)]).tolist()
-    return [Part(list(chain(*partition)), tuple(starmap(slice, pairwise(ends))), split=True, separate=True)]
-
-
-def partition_of(sharing: Sharing, n_outputs: int) -> list[list[int]]:
-    """The outputs of each independent model according to ``sharing``, in ascending order."""
-    everything = list(range(n_outputs))
-    if isinstance(sharing, str):
-        return [[o] for o in everything] if sharing == "none" else [everything]
-    try:
-        groups = sorted(sorted(index(o) for o in group) for group in sharing)
-    except TypeError:
-        groups = []
-    if not all(groups) or sorted(chain(*groups)) != everything:
-        raise ValueError(
-            f"sharing={sharing!r} must be 'all', 'kernel', 'none', 'auto' or a partition of the outputs, such as "
-            f"{[everything[:1], everything[1:]] if n_outputs > 1 else [everything]}: each of range({n_outputs}) in one "
-            "group."
-        )
-    return groups
-
-
-def models_of(
-    problem: Problem,
-    rng: np.random.RandomState,
-    monitor: Monitor,
-    threads: BlockMap,
-    previous: Fitted | None = None,
-) -> list[Model]:
-    """The models of a problem, each with its rows and its start. Arguments are those of `fit_model`."""
-    units, placement, parts = problem.units, problem.placement, parts_of(problem)
-    rows, all_rows = units.rows(problem.first_source, threads), units.rows(problem.source, threads)
-
-    # All models start with the same kernel. If outputs have their own inputs, kernels have own centres and points.
-    kernels = centred_kernels(problem.spec.covariance, rows.inputs)
-    sample, points = rows.sample(placement.sample_size, rng), []
-    if problem.vague.any():
-        check_independent(sample.features, problem.vague, units.prior.shared)
-    for output, kernel in enumerate(kernels):
-        inputs = sample.of([output]).inputs
-        alone = starting_table(problem, rows.outputs([output]), np.empty((1, 0, inputs.shape[1]))).values_at_start()
-        points.append(placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng))
-    hyperparameters, variance = problem.spec.starts.hyperparameters.value, 1.0
-    if hyperparameters is not None:
-        some = np.unique(np.linspace(0, len(points[0]) - 1, _CHECKED_POINTS).astype(int))
-        variance = checked_variance(kernels[0], hyperparameters, points[0][some])
-
-    # All models have the same seed: outputs that share nothing are then fitted as if each was alone.
-    seed = rng.randint(np.iinfo(np.int32).max)
-    goes_on = previous is not None and previous.outputs == [part.outputs for part in parts]
-    models = []
-    for number, part in enumerate(parts):
-        outputs, first_outputs = part.outputs, [part.outputs[group.start] for group in part.groups]
-        own_kernels = tuple(kernels[output % len(kernels)] for output in first_outputs)
-        warm = previous.values_in(units, rows, own_kernels[0], number) if goes_on and previous is not None else {}
-        if isinstance(placement.method, np.ndarray):
-            warm.pop("inducing_points", None)
-        sets, sets_before = [points[output % len(points)] for output in first_outputs], warm.get("inducing_points")
-        # If the number of points is to be found, it starts from the points of the fit before.
-        placed = (
-            sets_before is not None
-            and placement.max_inducing is not None
-            and len(sets_before) == len(sets)
-            and sets_before.shape[1] <= min(placement.max_inducing, len(rows))
-        )
-        start = np.array([own[: min(map(len, sets))] for own in sets])
-        if placed and sets_before is not None:
-            start = sets_before
-        # If all rows are points, the bound is the likelihood, and no other points are better.
-        complete = placement.takes_all_rows or (
-            problem.variant.family == "full"
-            and len(sample.targets) >= len(rows)
-            and all(
-                are_all_rows(own, sample.of([output]).inputs) for own, output in zip(start, first_outputs, strict=True)
-            )
-        )
-        exact = complete and not part.separate and problem.may_be_exact
-        n_kernels = len(start) if part.separate else None
-        table = starting_table(problem, rows.outputs(outputs), start, variance, n_kernels, exact)
-        if complete:
-            table = table.changed("inducing_points", fixed=True)
-        if problem.solver.takes_widest_limits:
-            table = table.widened(("signal", "noise"))
-        sparse = SparseModel(
-            kernel=own_kernels[0],
-            prior=units.internal_prior().outputs(outputs),
-            groups=part.groups,
-            variant=problem.variant,
-            jitter=problem.rules.jitter,
-            complete=complete,
-            kernels=own_kernels if part.split else None,
-        )
-        columns = range(outputs[0], outputs[-1] + 1)
-        shown = outputs[0] if len(outputs) == 1 else outputs
-        contrasts = n_contrasts(rows.total, problem.vague[outputs], units.prior.shared)
-        model = Model(
-            problem=problem,
-            sparse=sparse,
-            rows=all_rows.outputs(outputs, 1.0 / min(problem.n_threads, len(parts))).noisier(problem.row_variance),
-            table=table,
-            seed=seed,
-            monitor=monitor.seen_as(
-                shift=units.shift(contrasts, outputs),
-                outputs=columns if len(columns) == len(outputs) else tuple(outputs),
-                about="" if len(parts) == 1 else f"y[:, {shown}]",
-            ),
-            max_iter=problem.max_iter,
-            tol=problem.tol,
-            warm=table.started_at(warm).values_at_start() if goes_on else None,
-            placed=placed,
-            is_exact=exact,
-        )
-        models.append(model)
-    return models
 
 
 @dataclass(frozen=True)

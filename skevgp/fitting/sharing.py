@@ -18,7 +18,8 @@ from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .fitted import Fitted
 from .inducing import Placement
-from .model import Model, models_of
+from .model import Model
+from .parts import models_of
 from .problem import Problem
 
 # Largest loss of an output, as a share of the gain of its own Gaussian process over features and noise.

@@ -6,7 +6,7 @@ from skevgp.data.rows import LocalSource, Moments, RawRows
 from skevgp.data.threads import BlockMap
 from skevgp.fitting.fit import fit_model
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.model import models_of
+from skevgp.fitting.parts import models_of
 from skevgp.fitting.problem import Problem
 from skevgp.fitting.units import Units
 from skevgp.kernels.parse import parse_kernel

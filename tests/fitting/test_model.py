@@ -5,7 +5,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
-from skevgp.fitting.model import partition_of
+from skevgp.fitting.parts import partition_of
 from skevgp.fitting.search import FeaturesAlone
 from skevgp.model.bounds import Variant, bounds_alone
 from skevgp.solvers import LBFGS, Adam
