@@ -2,11 +2,13 @@
 
     python benchmarks/house.py            # print the meters and write them to benchmarks/results/house.csv
     python benchmarks/house.py --list     # also print each function that a fit enters, in order
+    python benchmarks/house.py --before DIR   # next to the meters of another checkout of the project
 
 The script traces a fit of 400 rows by `EVGPRegressor`. It counts the functions of the package that the fit enters,
 their files, and the pairs of files that call each other both ways. It counts returns: the first call of a function in a
 file that the fit had left. In the source it counts private names that cross between the classes of one estimator, and
-lines of code and of docstrings per folder. A comprehension does not count as a function.
+lines of code and of docstrings, named constants, and files that import one another in a circle, per folder. A
+comprehension does not count as a function.
 """
 
 from __future__ import annotations
@@ -14,10 +16,13 @@ from __future__ import annotations
 import argparse
 import ast
 import inspect
+import os
+import subprocess
 import sys
 import threading
 import tokenize
 import warnings
+from io import StringIO
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -99,9 +104,48 @@ def lines_of_folders() -> pd.DataFrame:
     return pd.DataFrame(counts, columns=["folder", *kinds]).groupby("folder").sum()
 
 
+def named_constants(folder: str) -> int:
+    """Names in capitals that are assigned a number, or several, at the top of a file of a folder."""
+    count = 0
+    for path in (PACKAGE / folder).glob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if not isinstance(node, ast.Assign) or not any(isinstance(n, ast.Constant) for n in ast.walk(node.value)):
+                continue
+            constants = [n.value for n in ast.walk(node.value) if isinstance(n, ast.Constant)]
+            if any(isinstance(value, str) for value in constants):
+                continue
+            names = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            count += sum(name.isupper() for name in names)
+    return count
+
+
+def files_in_a_circle(folder: str) -> int:
+    """Files of a folder that import one another in a circle, also if an import is for type hints only."""
+    paths = list((PACKAGE / folder).glob("*.py"))
+    imports = {}
+    for path in paths:
+        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        imports[path.stem] = {node.module.split(".")[0] for node in nodes if node.level == 1 and node.module}
+    reached = {name: set(others) for name, others in imports.items()}
+    for _ in paths:
+        reached = {
+            name: others.union(*(reached.get(other, set()) for other in others)) for name, others in reached.items()
+        }
+    return sum(name in others for name, others in reached.items())
+
+
+def meters_of(checkout: str) -> pd.Series:
+    """The meters of another checkout."""
+    command = [sys.executable, __file__, "--print"]
+    output = subprocess.run(command, env=os.environ | {"PYTHONPATH": checkout}, check=True, capture_output=True)
+    return pd.read_csv(StringIO(output.stdout.decode()), index_col="meter")["value"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--list", action="store_true")
+    parser.add_argument("--before", metavar="DIR", help="another checkout")
+    parser.add_argument("--print", action="store_true", help="print a CSV and write no file")
     options = parser.parse_args()
     functions, calls = functions_of_a_fit()
     files = [code.co_filename for code in functions]
@@ -116,11 +160,19 @@ def main() -> None:
         "returns to a file that was left": len(changes) - len(set(files)),
         "private names crossing between classes of an estimator": len(crossing_names()),
     }
+    for folder in ("fitting", "model"):
+        meters[f"files of {folder} in a circle of imports"] = files_in_a_circle(folder)
+        meters[f"named constants of {folder}"] = named_constants(folder)
     lines = lines_of_folders()
     lines.loc["all"] = lines.sum()
     for folder, numbers in lines.iterrows():
         meters |= {f"{kind} of {folder}": number for kind, number in numbers.items()}
     table = pd.DataFrame(meters.items(), columns=["meter", "value"])
+    if options.print:
+        print(table.to_csv(index=False))
+        return
+    if options.before:
+        table.insert(1, "before", table["meter"].map(meters_of(options.before)))
     table.to_csv(RESULTS, index=False)
     print(table.to_string(index=False))
 

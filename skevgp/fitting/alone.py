@@ -13,7 +13,7 @@ from ..model.exact import ExactModel
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable
 from .rules import LOWEST_NOISE
-from .search import FeaturesAlone
+from .runs import FeaturesAlone
 from .units import noise_of_most_evidence
 
 # Noise variances below this share of the prior sum of squares are lost in rounding.

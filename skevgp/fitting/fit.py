@@ -21,7 +21,8 @@ from .model import Model
 from .outliers import fit_doubting
 from .parts import models_of, parts_of
 from .problem import Problem
-from .search import Fit, search
+from .runs import Fit
+from .search import search
 from .sharing import with_groups
 from .start import with_signal_of_constants
 

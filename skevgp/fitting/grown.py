@@ -9,7 +9,8 @@ import numpy as np
 from ..model.parameters import Values
 from ..solvers import LBFGS
 from .model import Model
-from .search import Fit, Start, better, search
+from .runs import Fit, Start, better
+from .search import search
 
 # Inducing points are added until this raises the bound by less than so many nats per row and output.
 _GAIN = 0.01

@@ -26,7 +26,7 @@ from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .messages import ended_early, far_from_prior, learned_too_little, mini_batches_ended
 from .problem import Problem
 from .rules import Rules
-from .search import FeaturesAlone, Fit, Start, drawn
+from .runs import FeaturesAlone, Fit, Start
 from .units import may_hide_noise
 
 # Factor by which the number of inducing points grows.
@@ -180,8 +180,12 @@ class Model:
         return None if anew is None else partial(self._placed, placement=anew)
 
     def restart(self) -> Values:
-        """Random first values."""
-        values = drawn(self.table, self.rules, self.rng)
+        """Random first values of kernel and noise within their limits."""
+        coordinates = self.table.coordinates(self.table.start())
+        for name, factor in self.rules.restart_factors.items():
+            reach = np.log(factor)
+            coordinates[name] = coordinates[name] + self.rng.uniform(-reach, reach, coordinates[name].shape)
+        values = self.table.values(np.clip(self.table.flat(coordinates), *self.table.limits()))
         return self._placed(values, self.problem.placement) if self.table["inducing_points"].free.any() else values
 
     def _placed(self, values: Values, placement: Placement) -> Values:

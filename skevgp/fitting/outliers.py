@@ -15,7 +15,8 @@ from ..noise.base import RowScales
 from .doubts import FAR, FEW, TURNS, Look, RowDoubts, look_at, of_residuals, without
 from .model import ENOUGH, LEAST_TOL, Model
 from .robust import Neighbours, ordinary_variance
-from .search import Fit, Start, better, search
+from .runs import Fit, Start, better
+from .search import search
 
 # The first scales come from a fit of so many iterations to so many rows, or so many per inducing point.
 _LOOK_ITERATIONS, _LOOK_ROWS, _LOOK_ROWS_PER_POINT = 30, 2000, 10

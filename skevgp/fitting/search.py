@@ -6,17 +6,14 @@ enough. docs/guide/inside.md has a table of the rules, what each prevents, and t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
 
-from ..model.parameters import ParameterTable, Values
-from ..model.predictor import Predictor
-from ..utils.monitor import Monitor
-from .rules import Rules
+from ..model.parameters import Values
+from .model import Model
+from .runs import Fit, Start, better
 
 # In nats. With a smaller difference, rounding decides whether a white kernel or noise has the higher bound.
 _WORTH = 0.01
@@ -26,145 +23,11 @@ _SEEN = 1.0
 _LITTLE = 1e-4
 
 
-@dataclass(frozen=True)
-class Fit:
-    """The end of one run of an optimiser."""
-
-    values: Values
-    # In nats, in internal units. -inf if it could not be computed.
-    bound: float
-    # Minus the bound per iteration, including the fits that this one continues.
-    loss_curve: list[float] = field(default_factory=list)
-    converged: bool = True
-    # For the user. Empty if all is well.
-    message: str = ""
-    # Only if q is not at its optimum for the values.
-    predictor: Predictor | None = None
-    # Size of the sample that was fitted. None: all rows.
-    n_rows: int | None = None
-    # Names of the parameters that had their widest limits.
-    widened: tuple[str, ...] = ()
-
-    @property
-    def n_iter(self) -> int:
-        """Number of iterations."""
-        return len(self.loss_curve)
-
-    @property
-    def rank(self) -> tuple[float, float]:
-        """Sort key for the better of two fits: more rows first, then the higher bound."""
-        return np.inf if self.n_rows is None else self.n_rows, self.bound
-
-
-def better(best: Fit | None, fit: Fit) -> Fit:
-    """The fit with the higher rank. Of equal ones the later, which may have continued the other."""
-    return fit if best is None or fit.rank >= best.rank else best
-
-
-@dataclass(frozen=True)
-class FeaturesAlone:
-    """The bound of the features without a Gaussian process. A fit that ends below it has failed."""
-
-    bound: float
-    # (o,): the noise variances that reach the bound.
-    noise: np.ndarray
-    # An upper limit of the bound, if it depends on the end of a kernel with a fixed signal.
-    most: float = -np.inf
-    # Whether the noise may be far above the residuals, so that no fit climbs to it.
-    hidden: bool = False
-
-
-@dataclass(frozen=True)
-class Start:
-    """The start of a fit, and its limit of iterations."""
-
-    values: Values
-    # Largest number of iterations, including those of ``after``.
-    until: int
-    # The fit to the same rows that this one continues.
-    after: Fit | None = None
-    # Size of the sample to fit. None: all rows.
-    n_rows: int | None = None
-    # Whether the values are a first guess. The curvature of the bound there says little about its end.
-    cold: bool = False
-
-    @property
-    def loss_curve(self) -> list[float]:
-        """The loss of each iteration before this fit."""
-        return [] if self.after is None else self.after.loss_curve
-
-
-class Task(Protocol):
-    """What is searched: parameters with starts and limits, and a solver."""
-
-    @property
-    def table(self) -> ParameterTable:
-        """The parameters with first values and limits."""
-
-    @property
-    def rules(self) -> Rules:
-        """The rules of the search."""
-
-    @property
-    def max_iter(self) -> int:
-        """Largest number of iterations."""
-
-    @property
-    def monitor(self) -> Monitor:
-        """The monitor, which knows whether the fit was stopped."""
-
-    @property
-    def warm(self) -> Values | None:
-        """First values from another fit."""
-
-    @property
-    def placed(self) -> bool:
-        """Whether the first values have the inducing points of another fit."""
-
-    @property
-    def n_restarts(self) -> int:
-        """Number of further fits from random starts."""
-
-    @property
-    def mean_precision(self) -> float:
-        """Mean precision of the rows, in units of 1/σ²."""
-
-    @property
-    def scatter(self) -> np.ndarray:
-        """Noise variances (o,) that would explain all of the residuals."""
-
-    @property
-    def alone(self) -> FeaturesAlone:
-        """The bound of the features without a Gaussian process."""
-
-    @property
-    def interpolates(self) -> bool:
-        """Whether there are as many inducing points as rows, or none at all."""
-
-    @property
-    def samples(self) -> tuple[int, ...]:
-        """Sizes of the samples of rows that the fit begins with."""
-
-    @property
-    def lengthscale_mask(self) -> np.ndarray | bool:
-        """Whether each hyperparameter is the length scale of one of several columns, (n_hyper,)."""
-
-    @property
-    def place(self) -> Callable[[Values], Values] | None:
-        """The function that places inducing points again under the kernel of its argument. None if they stay."""
-
-    def restart(self) -> Values:
-        """Random first values."""
-
-    def minimise(self, start: Start) -> Fit:
-        """Run the solver from a start."""
-
-
 class _StoppedError(Exception):
     """Ctrl-C was pressed or the time is over. The best fit so far is the result."""
 
 
-def search(model: Task) -> Fit:
+def search(model: Model) -> Fit:
     """Fit a model from one start after another and return the best fit. After Ctrl-C, it is the best so far.
 
     Raises KeyboardInterrupt if there is none yet.
@@ -180,7 +43,7 @@ def search(model: Task) -> Fit:
 class Search:
     """The best fit of a model so far, and the rules for the next start."""
 
-    def __init__(self, model: Task):
+    def __init__(self, model: Model):
         self.model, self.rules, self.table, self.max_iter = model, model.rules, model.table, model.max_iter
         self.best: Fit | None = None
 
@@ -330,12 +193,3 @@ def moved(values: Values, length_factor: float, noise_factor: float) -> Values:
         "hyperparameters": length_factor * values["hyperparameters"],
         "noise": noise_factor * values["noise"],
     }
-
-
-def drawn(table: ParameterTable, rules: Rules, rng: np.random.RandomState) -> Values:
-    """Random first values of kernel and noise within their limits."""
-    coordinates = table.coordinates(table.start())
-    for name, factor in rules.restart_factors.items():
-        reach = np.log(factor)
-        coordinates[name] = coordinates[name] + rng.uniform(-reach, reach, coordinates[name].shape)
-    return table.values(np.clip(table.flat(coordinates), *table.limits()))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
@@ -20,14 +20,15 @@ from sklearn.exceptions import ConvergenceWarning
 
 from ..data.dataset import Dataset
 from ..data.maps import evenly_spaced, take_rows, transformed
-from ..data.rows import Source, times_weights
+from ..data.rows import times_weights
 from ..exceptions import UnidentifiedWarning, warn_user
 from ..features.theta import Prior
 from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
 from ..model.predictor import CoefficientPrior, Predictor
-from ..model.weights import ThetaStep, WeightLikelihood, likelihood_of_whitened, theta_step
+from ..model.weights import ThetaStep, likelihood_of_whitened, theta_step
 from ..utils.monitor import Monitor
 from ..utils.validation import is_dask
+from .fitted import Fitted
 from .problem import Problem
 
 # Newton steps end if they are shorter than this many posterior standard deviations, or after so many.
@@ -67,29 +68,8 @@ _EDGE = 2.0
 _FAR = 3.0
 
 
-class FitOfTheta(Protocol):
-    """The part of `Fitted` that is needed here."""
-
-    @property
-    def prior(self) -> CoefficientPrior:
-        """The prior of all weights in the user's units, with learned scales."""
-
-    @property
-    def lower_bound(self) -> float:
-        """Lower bound on the log marginal likelihood, in nats."""
-
-    def moved(self, source: Source, prior: CoefficientPrior) -> Self:
-        """The same kernel and noise, with other features and a prior of their weights."""
-
-    def weight_likelihoods(self, source: Source, prior: CoefficientPrior) -> list[WeightLikelihood]:
-        """The likelihood of the weights of each output, for other features, in the user's units."""
-
-    def predictor(self) -> Predictor:
-        """The predictor of all outputs, in the user's units."""
-
-
 # Takes a problem, an earlier fit to continue, whether a rough result is enough, and what it is for the progress.
-FitProblem = Callable[[Problem, Any, bool, str], Any]
+FitProblem = Callable[[Problem, Fitted | None, bool, str], Fitted]
 # Takes z and the step before. None: the features are not finite at z.
 StepAt = Callable[[np.ndarray, ThetaStep], ThetaStep | None]
 
@@ -101,7 +81,7 @@ class Calibration:
     # The data with the features at the mode of z, and the problem of the last fit.
     data: Dataset
     problem: Problem
-    fitted: Any
+    fitted: Fitted
     posterior: ThetaPosterior
 
     def warn(self) -> None:
@@ -148,10 +128,10 @@ class ThetaPosterior:
         K = step.K[:, :, np.abs(step.K).max(axis=(0, 1), initial=0.0) > 0.0]
         return cls(theta, step.z + move, RA @ RA.T, twice, bend, K)
 
-    def predictor(self, fitted: Any) -> Predictor:
+    def predictor(self, fitted: Fitted) -> Predictor:
         """The predictor of a fit, with outputs that share θ."""
-        found: Predictor = fitted.predictor()
-        return found if self.K is None else found.with_theta(self.K)
+        predictor = fitted.predictor()
+        return predictor if self.K is None else predictor.with_theta(self.K)
 
     def z_under(self, priors: Sequence[Prior]) -> np.ndarray:
         """The coordinates (q,) of the mean under other priors of the same parameters."""
@@ -375,7 +355,7 @@ class _Calibrator:
 
     # --- with a Gaussian process --------------------------------------------------------------------------------------
 
-    def finished(self, step: ThetaStep, data: Dataset, fitted: FitOfTheta) -> Any:
+    def finished(self, step: ThetaStep, data: Dataset, fitted: Fitted) -> Fitted:
         """A fit with the features and the prior at a value of z."""
         prior = replace(restricted(fitted.prior, self.p), reference=step.reference)
         return fitted.moved(data.source, extended(prior, step))
@@ -384,7 +364,7 @@ class _Calibrator:
         """The problem with the features linearised at a value of z."""
         return self.problem.with_features(data, extended(self.prior, step))
 
-    def step_at(self, fitted: FitOfTheta, z: np.ndarray, before: ThetaStep) -> ThetaStep | None:
+    def step_at(self, fitted: Fitted, z: np.ndarray, before: ThetaStep) -> ThetaStep | None:
         """What the data say about z under the kernel and noise of a fit. None: the features are not finite."""
         try:
             data = self.data_at(z)
@@ -394,12 +374,12 @@ class _Calibrator:
         likelihoods = fitted.weight_likelihoods(data.source, extended(prior, before))
         return theta_step(likelihoods, prior, self.columns, z)
 
-    def settled(self, step: ThetaStep, fitted: FitOfTheta) -> ThetaStep:
+    def settled(self, step: ThetaStep, fitted: Fitted) -> ThetaStep:
         """The mode of z under the kernel and noise of a fit."""
         here = self._known(self.step_at(fitted, step.z, step))
         return climbed(here, partial(self.step_at, fitted))
 
-    def bend(self, step: ThetaStep, fitted: FitOfTheta) -> np.ndarray | None:
+    def bend(self, step: ThetaStep, fitted: Fitted) -> np.ndarray | None:
         """The inverse of A (q, q), below, if f is orthogonal to the features. None: it is the identity."""
         # z is then that of the best fit in least squares, where the gradient s(z) = σ⁻² Jᵀ (y - h(z)) - z is 0. The
         # residuals contain f and may be large, so that Gauss and Newton's s' = -Λ is not good enough. As Var[s] is Λ to
@@ -471,7 +451,7 @@ def calibrate(
     fit: FitProblem,
     rng: np.random.RandomState,
     monitor: Monitor,
-    previous: tuple[Any, ThetaPosterior | None] = (None, None),
+    previous: tuple[Fitted | None, ThetaPosterior | None] = (None, None),
 ) -> Calibration | None:
     """Fit a problem whose feature map has parameters, or return None if it has none.
 
@@ -520,6 +500,7 @@ def calibrate(
         ended = ended or problem.max_iter == 0
         if ended or (own.nonlinearity(at_start, step) < _NONLINEAR**2 * fitted.predictor().noise).all():
             break
+    assert fitted is not None
     at_mode = own.data_at(step.z)
     found = Theta.of(at_mode.maps.feature_map.feature_map)
     assert found is not None
@@ -536,8 +517,8 @@ def rough_tol(problem: Problem) -> float:
 
 
 def after_more_rows(
-    posterior: ThetaPosterior, linearized: LinearizedFeatures, fitted: Any
-) -> tuple[ThetaPosterior, Any]:
+    posterior: ThetaPosterior, linearized: LinearizedFeatures, fitted: Fitted
+) -> tuple[ThetaPosterior, Fitted]:
     """The posterior of z, and the models, after new rows. The features stay linearised where they are."""
     p = fitted.prior.scale.shape[1] - len(linearized.columns)
     prior = restricted(fitted.prior, p)

@@ -11,7 +11,7 @@ from skevgp.fitting.fit import finished
 from skevgp.fitting.folds import CrossValidation
 from skevgp.fitting.grown import exact_model_of_sample, grown
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.search import Fit
+from skevgp.fitting.runs import Fit
 from skevgp.utils.monitor import Monitor
 
 from .cases import NO_FEATURES, N, O, X, Y, data_of, fitted, model_of, units_of

@@ -6,7 +6,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
 from skevgp.fitting.parts import partition_of
-from skevgp.fitting.search import FeaturesAlone
+from skevgp.fitting.runs import FeaturesAlone
 from skevgp.model.bounds import Variant, bounds_alone
 from skevgp.solvers import LBFGS, Adam
 from skevgp.utils.monitor import Monitor

@@ -6,7 +6,7 @@ import pytest
 from skevgp.fitting import outliers
 from skevgp.fitting.doubts import Look, RowDoubts, look_at
 from skevgp.fitting.outliers import settle
-from skevgp.fitting.search import Start, better
+from skevgp.fitting.runs import Start, better
 from skevgp.model.bounds import Variant
 from skevgp.noise import StudentT
 from skevgp.noise.student_t import StudentTScales

@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from skevgp.fitting.rules import Rules
-from skevgp.fitting.search import (
-    FeaturesAlone,
-    Fit,
-    better,
-    search,
-)
+from skevgp.fitting.runs import FeaturesAlone, Fit, better
+from skevgp.fitting.search import search
 from skevgp.model.parameters import Parameter, ParameterTable
 from skevgp.utils.monitor import Monitor
 
