@@ -45,11 +45,11 @@ def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, pr
         fitted = side_by_side(_fit_one, turns, at_once, monitor)
     finally:
         threads.close()
-    messages = sorted({one.message for one in fitted if one.message})
+    messages = sorted({model.message for model in fitted if model.message})
     if monitor.stopped or monitor.out_of_time:
-        n_iter, max_time = max(len(one.loss_curve) for one in fitted), None if monitor.stopped else monitor.max_time
+        n_iter, max_time = max(len(model.loss_curve) for model in fitted), None if monitor.stopped else monitor.max_time
         messages = [interrupted(n_iter, max_time)]
-    return Fitted(problem.units, [part.outputs for part in parts], problem.found, tuple(fitted), tuple(messages))
+    return Fitted(problem.units, problem.sharing_found, tuple(fitted), tuple(messages))
 
 
 def _fit_one(turn: tuple[Model, float]) -> FittedModel:
@@ -93,7 +93,7 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     if fit.predictor is not None and not changed and isinstance(posterior, SparsePosterior):
         posterior = posterior.with_q(fit.predictor, fit.bound - log_prior(values))
     message = " ".join(part for part in messages if part)
-    return FittedModel(posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
+    return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
 
 
 def _calibrated(

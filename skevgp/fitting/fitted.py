@@ -23,6 +23,8 @@ from .units import Units
 class FittedModel:
     """A fitted model of some outputs, in internal units."""
 
+    # Columns of y.
+    outputs: list[int]
     posterior: Posterior
     # The limits and the start of the parameters.
     table: ParameterTable
@@ -96,23 +98,25 @@ class Fitted:
     """The fitted models of all outputs."""
 
     units: Units
-    # Of each model.
-    outputs: list[list[int]]
     # Whether the groups of outputs were found, and not given.
-    found: bool
+    sharing_found: bool
     models: tuple[FittedModel, ...]
     # For the user.
     messages: tuple[str, ...]
 
     def predictor(self) -> Predictor:
         """The predictor of all outputs, in the user's units."""
-        return self.units.predictor([one.predictor for one in self.models], self.outputs)
+        return self.units.predictor([model.predictor for model in self.models], self.outputs)
+
+    @property
+    def outputs(self) -> list[list[int]]:
+        """The columns of y of each model."""
+        return [model.outputs for model in self.models]
 
     def updated(self, source: Source, weight: float = 1.0, row_variance: np.ndarray | None = None) -> Fitted:
         """The models with new rows. ``weight`` multiplies the log likelihood of the earlier rows."""
         rows = self.units.rows(source)
-        pairs = zip(self.outputs, self.models, strict=True)
-        models = (one.updated(rows.outputs(own).noisier(row_variance), weight) for own, one in pairs)
+        models = (model.updated(rows.outputs(model.outputs).noisier(row_variance), weight) for model in self.models)
         return replace(self, models=tuple(models))
 
     # --- other features of the same rows (see `fitting.theta`) --------------------------------------------------------
@@ -120,21 +124,19 @@ class Fitted:
     def moved(self, source: Source, prior: CoefficientPrior) -> Fitted:
         """The models with the same kernel and noise, other features, and a prior with learned scales for these."""
         units = self._with_prior(prior)
-        rows, internal = units.rows(source), units.internal_prior()
-        pairs = zip(self.outputs, self.models, strict=True)
-        models = (
-            replace(model, posterior=model.posterior.moved(internal.outputs(outputs), rows.outputs(outputs)))
-            for outputs, model in pairs
-        )
+        rows, internal, models = units.rows(source), units.internal_prior(), []
+        for model in self.models:
+            posterior = model.posterior.moved(internal.outputs(model.outputs), rows.outputs(model.outputs))
+            models.append(replace(model, posterior=posterior))
         return replace(self, units=units, models=tuple(models))
 
     def reweighted(self, prior: CoefficientPrior) -> Fitted:
         """The models, after new rows, with another prior of the weights that has the same offset."""
         units = self._with_prior(prior)
         internal, models = units.internal_prior(), []
-        for outputs, model in zip(self.outputs, self.models, strict=True):
+        for model in self.models:
             assert isinstance(model.posterior, SparsePosterior)
-            models.append(replace(model, posterior=model.posterior.reweighted(internal.outputs(outputs))))
+            models.append(replace(model, posterior=model.posterior.reweighted(internal.outputs(model.outputs))))
         return replace(self, units=units, models=tuple(models))
 
     def weight_likelihoods(
@@ -146,11 +148,12 @@ class Fitted:
         """
         units = self.units if prior is None else self._with_prior(prior)
         rows, internal = None if source is None else units.rows(source), units.internal_prior()
-        found: dict[int, WeightLikelihood] = {}
-        for own, one in zip(self.outputs, self.models, strict=True):
-            each = one.posterior.weight_likelihoods(internal.outputs(own), None if rows is None else rows.outputs(own))
-            found |= {o: each[i].in_units(units.target_unit[o]) for i, o in enumerate(own)}
-        return [found[o] for o in sorted(found)]
+        likelihoods: dict[int, WeightLikelihood] = {}
+        for model in self.models:
+            rows_of_model = None if rows is None else rows.outputs(model.outputs)
+            of_model = model.posterior.weight_likelihoods(internal.outputs(model.outputs), rows_of_model)
+            likelihoods |= dict(zip(model.outputs, of_model, strict=True))
+        return [likelihoods[o].in_units(unit) for o, unit in enumerate(units.target_unit)]
 
     def _with_prior(self, prior: CoefficientPrior) -> Units:
         """The units with a prior that has the learned scales."""
@@ -159,8 +162,8 @@ class Fitted:
 
     def _factors(self) -> np.ndarray:
         factors = np.ones((len(self.units.target_unit), self.units.prior.n_groups))
-        for outputs, one in zip(self.outputs, self.models, strict=True):
-            factors[outputs] = one.values.get("coef_factors", 1.0)
+        for model in self.models:
+            factors[model.outputs] = model.values.get("coef_factors", 1.0)
         return factors
 
     @property
@@ -171,33 +174,33 @@ class Fitted:
     @property
     def row_scales(self) -> np.ndarray | None:
         """E[τ] of each row and model, (n, n_models). None for Gaussian noise."""
-        each = [one.doubts.scales.mean for one in self.models if one.doubts is not None]
-        return np.column_stack(each) if each else None
+        scales = [model.doubts.scales.mean for model in self.models if model.doubts is not None]
+        return np.column_stack(scales) if scales else None
 
     @property
     def dependent(self) -> bool:
         """Whether neighbouring rows are alike."""
-        return any(one.dependent for one in self.models)
+        return any(model.dependent for model in self.models)
 
     @property
     def gone(self) -> int:
         """Number of outputs that predict held-out groups no better than the features alone."""
-        return sum(one.gone for one in self.models)
+        return sum(model.gone for model in self.models)
 
     @property
     def lower_bound(self) -> float:
         """Lower bound on the log marginal likelihood, in nats, summed over outputs."""
-        return sum(one.bound for one in self.models) - self._shift
+        return sum(model.bound for model in self.models) - self._shift
 
     @property
     def upper_bound(self) -> float:
         """Upper bound on the log marginal likelihood, in nats, summed over outputs."""
-        return sum(one.upper_bound for one in self.models) - self._shift
+        return sum(model.upper_bound for model in self.models) - self._shift
 
     @property
     def n_iter(self) -> int:
         """Number of iterations of the longest fit."""
-        return max(len(one.loss_curve) for one in self.models)
+        return max(len(model.loss_curve) for model in self.models)
 
     @property
     def loss_curve(self) -> np.ndarray:
@@ -205,58 +208,56 @@ class Fitted:
         if self.n_iter == 0:
             return np.empty(0)
         # A model without free parameters has no iterations.
-        curves = [one.loss_curve or [-one.bound] for one in self.models]
+        curves = [model.loss_curve or [-model.bound] for model in self.models]
         return np.sum([np.pad(curve, (0, self.n_iter - len(curve)), "edge") for curve in curves], axis=0) + self._shift
 
     @property
     def _shift(self) -> float:
         # The loss of all rows in the user's units less that in internal ones.
-        pairs = zip(self.outputs, self.models, strict=True)
-        return sum(self.units.shift(model.posterior.n_contrasts, outputs) for outputs, model in pairs)
+        return sum(self.units.shift(model.posterior.n_contrasts, model.outputs) for model in self.models)
 
     @property
     def n_parameters(self) -> int:
         """Number of free parameters of kernels, noise, inducing points and q."""
         total = 0
-        for one in self.models:
-            n_outputs, p = one.sparse.prior.scale.shape
-            m, of_weights = one.values["inducing_points"].shape[1], p + p * (p + 1) // 2
+        for model in self.models:
+            n_outputs, p = model.sparse.prior.scale.shape
+            m, of_weights = model.values["inducing_points"].shape[1], p + p * (p + 1) // 2
             of_values = m + m * (m + 1) // 2 + m * p
-            if one.sparse.variant.family == "diagonal":
+            if model.sparse.variant.family == "diagonal":
                 of_values, of_weights = 2 * m, 2 * p
-            total += one.table.size + n_outputs * of_values
-            total += of_weights * (1 if one.sparse.prior.shared else n_outputs)
+            total += model.table.size + n_outputs * of_values
+            total += of_weights * (1 if model.sparse.prior.shared else n_outputs)
         return total
 
     @property
     def sharing(self) -> list[list[int]]:
         """The groups of outputs that share a kernel."""
-        found = []
-        for outputs, one in zip(self.outputs, self.models, strict=True):
-            separate = one.values["hyperparameters"].ndim == 2
-            found += [outputs[group] for group in one.sparse.groups] if separate else [outputs]
-        return sorted(found)
+        partition = []
+        for model in self.models:
+            separate = model.values["hyperparameters"].ndim == 2
+            partition += [model.outputs[group] for group in model.sparse.groups] if separate else [model.outputs]
+        return sorted(partition)
 
     def limits(self, name: str, output: int) -> np.ndarray:
         """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
-        one, within = next(
-            (one, own.index(output)) for own, one in zip(self.outputs, self.models, strict=True) if output in own
-        )
-        limits = one.table[name].value_limits()
+        model = next(model for model in self.models if output in model.outputs)
+        within = model.outputs.index(output)
+        limits = model.table[name].value_limits()
         if name == "signal":
             # Calibration may have moved it outside.
-            (low, high), signal = limits[within], one.values["signal"][within]
+            (low, high), signal = limits[within], model.values["signal"][within]
             return np.array([[min(low, signal), max(high, signal)]]) * self.units.target_unit[output] ** 2
-        if one.table[name].start.ndim == 1:
+        if model.table[name].start.ndim == 1:
             return limits
-        return limits.reshape(*one.table[name].start.shape, 2)[one.sparse.set_of(within, one.table[name])]
+        return limits.reshape(*model.table[name].start.shape, 2)[model.sparse.set_of(within, model.table[name])]
 
-    def values_in(self, units: Units, rows: Rows, kernel: Kernel, model: int) -> Values:
+    def values_in(self, units: Units, rows: Rows, kernel: Kernel, number: int) -> Values:
         """The values of a model in other internal units, as far as they are useful for another fit."""
-        one, own, inputs = self.models[model], self.outputs[model], rows.inputs
-        values, points = one.values, one.values["inducing_points"]
-        if inputs.mean.ndim == 2 and one.sparse.kernels is None:
-            inputs = inputs.at(own)
+        model, inputs = self.models[number], rows.inputs
+        outputs, values, points = model.outputs, model.values, model.values["inducing_points"]
+        if inputs.mean.ndim == 2 and model.sparse.kernels is None:
+            inputs = inputs.at(outputs)
         if points.shape[2] != inputs.mean.shape[-1] or (inputs.mean.ndim == 2 and len(points) != len(inputs.mean)):
             return {}
         lowest, highest = (edge.reshape(-1, 1, points.shape[2]) for edge in (inputs.lowest, inputs.highest))
@@ -264,10 +265,10 @@ class Fitted:
         # For a smooth function a few points may be far outside. If most are, the rows are different ones.
         if outside.any(axis=-1).mean() > 0.5:
             return {}
-        ratio = (self.units.target_unit[own] / units.target_unit[own]) ** 2
-        found = {"noise": values["noise"] * ratio, "inducing_points": points}
+        ratio = (self.units.target_unit[outputs] / units.target_unit[outputs]) ** 2
+        useful = {"noise": values["noise"] * ratio, "inducing_points": points}
         if self.units.prior.labels == units.prior.labels and "coef_factors" in values:
-            found["coef_factors"] = values["coef_factors"]
-        if one.sparse.kernel == kernel:
-            found |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
-        return found
+            useful["coef_factors"] = values["coef_factors"]
+        if model.sparse.kernel == kernel:
+            useful |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
+        return useful

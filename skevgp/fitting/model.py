@@ -71,6 +71,11 @@ class Model:
     # --- the rows -----------------------------------------------------------------------------------------------------
 
     @property
+    def outputs(self) -> list[int]:
+        """Columns of y."""
+        return np.arange(self.problem.n_outputs)[self.rows.columns].tolist()
+
+    @property
     def n_inducing(self) -> int:
         """Number of inducing points of each set."""
         return self.table["inducing_points"].start.shape[1]

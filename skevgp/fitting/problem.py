@@ -68,7 +68,7 @@ class Problem:
     tol: float | None = None
     sharing: Sharing = "all"
     # Whether ``sharing`` was found by the fit, and not given.
-    found: bool = False
+    sharing_found: bool = False
     variant: Variant = field(default_factory=Variant)
     # The folds by which signal and noise are calibrated.
     noise_cv: CrossValidation | None = None

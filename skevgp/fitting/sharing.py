@@ -47,14 +47,18 @@ def with_groups(
         return problem
     if problem.per_output:
         return replace(problem, sharing="none")
-    if previous is not None and previous.found and len(previous.units.target_unit) == len(problem.units.target_unit):
-        return replace(problem, sharing=previous.sharing, found=True)
+    if (
+        previous is not None
+        and previous.sharing_found
+        and len(previous.units.target_unit) == len(problem.units.target_unit)
+    ):
+        return replace(problem, sharing=previous.sharing, sharing_found=True)
     groups = found_groups(problem, deepcopy(rng), part := monitor.silent().with_time(_SHARE_OF_TIME))
     if monitor.stopped:
         raise KeyboardInterrupt
     if part.stopped:
         return replace(problem, sharing="all")
-    return replace(problem, sharing=groups, found=True)
+    return replace(problem, sharing=groups, sharing_found=True)
 
 
 def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> list[list[int]]:
