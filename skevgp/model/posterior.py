@@ -79,12 +79,14 @@ class SparsePosterior:
             return self.sparse.upper_bound(self.values, self.statistics)
         return self.from_rows.upper_bound
 
-    @cached_property
+    @property
     def predictor(self) -> Predictor:
         """The predictor of residuals, in internal units."""
-        if self.from_rows is None:
-            return self.sparse.at_optimum(self.values, self.statistics, self.known_whitenings)
-        return self.from_rows.predictor
+        return self._at_optimum if self.from_rows is None else self.from_rows.predictor
+
+    @cached_property
+    def _at_optimum(self) -> Predictor:
+        return self.sparse.at_optimum(self.values, self.statistics, self.known_whitenings)
 
     @property
     def n_contrasts(self) -> np.ndarray:
