@@ -118,9 +118,8 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows, names: Sequence[str]) ->
     far = ((np.abs(prior.reference) > _FAR_WEIGHT) & fixed)[:, :p].any(axis=0)
     if far.any():
         far_names = [str(name) for name, is_far in zip(names, far, strict=True) if is_far]
-        shown = ", ".join(far_names[:_NAMES]) + (
-            f" and {len(far_names) - _NAMES} more" if len(far_names) > _NAMES else ""
-        )
+        shown, n_more = ", ".join(far_names[:_NAMES]), len(far_names) - _NAMES
+        shown += f" and {n_more} more" if n_more > 0 else ""
         return (
             f"The weights of {shown} are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior "
             "mean. Check the units of X and y, or raise the scale of coef_prior for these weights."
