@@ -423,8 +423,8 @@ def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") ->
             yield from _parts(steps[-1], first, columns, name)
     else:
         for part in parts_of_union(feature_map, first):
-            own_name = f"{name}: {part.name}" if name else part.name
-            for inner in _parts(part.transformer, part.rows, columns[part.columns], own_name):
+            part_name = f"{name}: {part.name}" if name else part.name
+            for inner in _parts(part.transformer, part.rows, columns[part.columns], part_name):
                 yield inner._replace(weight=part.weight * inner.weight)
 
 
