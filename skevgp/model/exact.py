@@ -204,9 +204,9 @@ class ExactModel:
         width = max(len(reference) for _, reference, _ in reduced)
         features, reference = np.zeros((n, o, width)), np.zeros((o, width))
         labels = np.full((o, width), -1)
-        for index, (own_features, own_reference, own_groups) in enumerate(reduced):
-            k = len(own_reference)
-            features[:, index, :k], reference[index, :k], labels[index, :k] = own_features, own_reference, own_groups
+        for index, (H, w0, groups_of_output) in enumerate(reduced):
+            k = len(w0)
+            features[:, index, :k], reference[index, :k], labels[index, :k] = H, w0, groups_of_output
         prior = CoefficientPrior(
             np.zeros((o, width)),
             np.ones((o, width)),
