@@ -137,17 +137,17 @@ class PredictorGroup:
         """
         m, s = len(points), np.sqrt(signal)[:, np.newaxis]
         # mean Tᵀ and root Tᵀ, with T = blockdiag(s I, C) of each output (see `bounds.Group.times_T`).
-        own_mean, own_root, leak = np.array(mean), np.array(root), None
+        means, roots, leak = np.array(mean), np.array(root), None
         if leaks is not None:
             # w = w⊥ - leak v, and in the predictor's coordinates β⊥ = β + (C leak / s) (s v).
             leaks_of_outputs = np.array(leaks)
-            own_mean[:, m:] -= np.einsum("opm,om->op", leaks_of_outputs, own_mean[:, :m])
-            own_root[:, :, m:] -= np.einsum("okm,opm->okp", own_root[:, :, :m], leaks_of_outputs)
+            means[:, m:] -= np.einsum("opm,om->op", leaks_of_outputs, means[:, :m])
+            roots[:, :, m:] -= np.einsum("okm,opm->okp", roots[:, :, :m], leaks_of_outputs)
             leak = prior.roots() @ leaks_of_outputs / s[:, np.newaxis]
-        own_mean[:, :m] *= s
-        own_mean[:, m:] = prior.times(own_mean[:, m:])
-        own_root[:, :, :m] *= s[:, np.newaxis]
-        own_root[:, :, m:] = own_root[:, :, m:] @ prior.roots().transpose(0, 2, 1)
+        means[:, :m] *= s
+        means[:, m:] = prior.times(means[:, m:])
+        roots[:, :, :m] *= s[:, np.newaxis]
+        roots[:, :, m:] = roots[:, :, m:] @ prior.roots().transpose(0, 2, 1)
         return cls(
             outputs=outputs,
             kernel=kernel,
@@ -155,8 +155,8 @@ class PredictorGroup:
             points=points,
             whitening=whitening,
             signal=signal,
-            mean=own_mean,
-            root=own_root,
+            mean=means,
+            root=roots,
             leak=leak,
         )
 
@@ -315,8 +315,8 @@ class Predictor:
         # Outputs that share their weights share one draw of them. Their other parts are independent.
         of_weights = rng.standard_normal((common.shape[1], n_samples))
         samples = [
-            own_mean[:, np.newaxis] + covariance_root(matrix, size) @ rng.standard_normal((len(mean), n_samples))
-            for own_mean, matrix, size in zip(mean.T, covariances, sizes, strict=True)
+            mean_of_output[:, np.newaxis] + covariance_root(matrix, size) @ rng.standard_normal((len(mean), n_samples))
+            for mean_of_output, matrix, size in zip(mean.T, covariances, sizes, strict=True)
         ]
         return np.stack([draws + shared.T @ of_weights for draws, shared in zip(samples, common, strict=True)], axis=1)
 
@@ -340,10 +340,10 @@ class Predictor:
             K = group.kernel.at(np.log(group.hyperparameters), rows.inputs).matrix()
             prior, unexplained = diagonal_of(K), K - V.T @ V
             matrices, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
-            for matrix, own_sizes, signal, root in zip(matrices, terms, group.signal, group.root, strict=True):
+            for matrix, sizes_of_output, signal, root in zip(matrices, terms, group.signal, group.root, strict=True):
                 deviation = root[: len(root) - p] @ rows.P
                 matrix[...] = signal * unexplained + deviation.T @ deviation
-                own_sizes[...] = signal * prior + np.square(deviation).sum(axis=0)
+                sizes_of_output[...] = signal * prior + np.square(deviation).sum(axis=0)
             covariances[group.outputs], sizes[group.outputs] = matrices, terms
         of_weights = np.square(common).sum(axis=1)
         diagonals, sizes = (variance + noise).T - of_weights, sizes + of_weights
