@@ -64,9 +64,9 @@ def folds_in_order(order: np.ndarray, n_folds: int, rng: np.random.RandomState, 
 
 def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState, order: np.ndarray) -> list[Fold]:
     """Folds of whole groups, of nearly equal numbers of rows. A group that is too large is cut by ``order`` (n,)."""
-    names, own, sizes = np.unique(groups, return_inverse=True, return_counts=True)
+    names, group_of_row, sizes = np.unique(groups, return_inverse=True, return_counts=True)
     if sizes.max() >= _LARGEST_SHARE * len(groups):
-        return folds_in_order(order[np.argsort(own[order], kind="stable")], n_folds, rng, gap=True)
+        return folds_in_order(order[np.argsort(group_of_row[order], kind="stable")], n_folds, rng, gap=True)
     n_folds = min(n_folds, len(names))
     # The largest group first, each to the fold with the fewest rows. Equal ones come in random order.
     shuffled = rng.permutation(len(names))
@@ -74,7 +74,7 @@ def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState
     for group in shuffled[np.argsort(-sizes[shuffled], kind="stable")]:
         fold_of[group] = np.argmin(load)
         load[fold_of[group]] += sizes[group]
-    folds = fold_of[own]
+    folds = fold_of[group_of_row]
     return _thinned([np.flatnonzero(folds == fold) for fold in range(n_folds)], rng)
 
 
@@ -83,10 +83,10 @@ def _thinned(parts: list[np.ndarray], rng: np.random.RandomState, inner: list[np
     inner = parts if inner is None else inner
     share = min(1.0, PREDICTED_ROWS / sum(map(len, inner)))
     folds = []
-    for rows, own in zip(parts, inner, strict=True):
+    for rows, predicted in zip(parts, inner, strict=True):
         if share < 1.0:
-            own = rng.permutation(own)[: max(round(share * len(own)), 1)]
-        folds.append(Fold(np.sort(rows), np.sort(own)))
+            predicted = rng.permutation(predicted)[: max(round(share * len(predicted)), 1)]
+        folds.append(Fold(np.sort(rows), np.sort(predicted)))
     return folds
 
 
@@ -96,13 +96,15 @@ def follow_a_path(order: np.ndarray, inputs: Callable[[np.ndarray], np.ndarray])
     ``order`` (n,) are the rows in the user's order. ``inputs`` returns rows (n, ...) by index.
     """
     first = np.unique(np.linspace(0, len(order) - 2, min(len(order) - 1, _MOST_STEPS)).astype(int))
-    here, there = (inputs(order[rows]).reshape(len(rows), -1) for rows in (first, first + 1))
-    scale = here.std(axis=0)
-    here, there, scale = here[:, scale > 0.0], there[:, scale > 0.0], scale[scale > 0.0]
-    steps = (there - here) / scale
+    starts, ends = (inputs(order[rows]).reshape(len(rows), -1) for rows in (first, first + 1))
+    scale = starts.std(axis=0)
+    starts, ends, scale = starts[:, scale > 0.0], ends[:, scale > 0.0], scale[scale > 0.0]
+    steps = (ends - starts) / scale
     if steps.shape[1] < _SLOW_DIRECTIONS or (steps >= 0.0).all(axis=0).any() or (steps <= 0.0).all(axis=0).any():
         return False
-    _, sizes, directions = np.linalg.svd((here - here.mean(axis=0)) / scale / np.sqrt(len(here)), full_matrices=False)
+    _, sizes, directions = np.linalg.svd(
+        (starts - starts.mean(axis=0)) / scale / np.sqrt(len(starts)), full_matrices=False
+    )
     kept = sizes > _FLAT
     along = steps @ (directions[kept].T / sizes[kept])
     shares = np.linalg.eigvalsh(along.T @ along / (2.0 * len(along)))

@@ -104,9 +104,9 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows, names: Sequence[str]) ->
     """Message that y, or a weight, is too far from its prior mean. ``names`` are those of the first weights."""
     # Residuals that are rounding errors of y are not of size one. The range shows their size even if a few rows have
     # almost all of the precision.
-    y, own = rows.residuals, rows.columns
-    size = np.maximum(np.sqrt(rows.scatter() / rows.mean_precision), _STD_OF_RANGE * (y.highest - y.lowest)[own])
-    if (size < np.minimum(np.abs(y.mean[own]), 1.0) / _FAR).any():
+    y, columns = rows.residuals, rows.columns
+    size = np.maximum(np.sqrt(rows.scatter() / rows.mean_precision), _STD_OF_RANGE * (y.highest - y.lowest)[columns])
+    if (size < np.minimum(np.abs(y.mean[columns]), 1.0) / _FAR).any():
         return (
             f"y is more than {_FAR:g} times its scatter away from its prior mean of 0, which leaves the kernel little "
             "accuracy for the rest. Set normalize_y=True, or add an intercept to the feature_map."
@@ -117,8 +117,9 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows, names: Sequence[str]) ->
     fixed = (prior.scale > 0.0) & (True if prior.groups is None else prior.groups < 0)
     far = ((np.abs(prior.reference) > _FAR_WEIGHT) & fixed)[:, :p].any(axis=0)
     if far.any():
-        told = [str(name) for name, is_far in zip(names, far, strict=True) if is_far]
-        shown = ", ".join(told[:_NAMES]) + (f" and {len(told) - _NAMES} more" if len(told) > _NAMES else "")
+        far_names = [str(name) for name, is_far in zip(names, far, strict=True) if is_far]
+        shown, n_more = ", ".join(far_names[:_NAMES]), len(far_names) - _NAMES
+        shown += f" and {n_more} more" if n_more > 0 else ""
         return (
             f"The weights of {shown} are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior "
             "mean. Check the units of X and y, or raise the scale of coef_prior for these weights."
@@ -128,12 +129,12 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows, names: Sequence[str]) ->
 
 def learned_too_little(kernel: Kernel, values: Values, table: ParameterTable, rows: Rows, sparse: bool = True) -> str:
     """Message that the noise, or a white kernel, explains what the Gaussian process could have learned."""
-    told = ""
+    message = ""
     if table["noise"].free.any():
-        told = nothing_learned(values["noise"], rows, sparse)
-    if not told and table["hyperparameters"].free.any():
-        told = white_kernel(kernel, values["hyperparameters"], rows)
-    return told
+        message = nothing_learned(values["noise"], rows, sparse)
+    if not message and table["hyperparameters"].free.any():
+        message = white_kernel(kernel, values["hyperparameters"], rows)
+    return message
 
 
 def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
@@ -163,9 +164,9 @@ def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str
     """Message that the kernel k̃ itself became white noise, though neighbouring rows are alike."""
     if len(rows) < 2:
         return ""
-    each, other = neighbours(rows, _PAIRS)
-    n = len(each.inputs)
-    K = np.abs(kernel.at(np.log(hyperparameters), np.vstack([each.inputs, other.inputs])).matrix())
+    sampled, nearest = neighbours(rows, _PAIRS)
+    n = len(sampled.inputs)
+    K = np.abs(kernel.at(np.log(hyperparameters), np.vstack([sampled.inputs, nearest.inputs])).matrix())
     variance = np.diagonal(K)
     correlated = np.diagonal(K[:n, n:]) >= _WHITE * np.sqrt(variance[:n]) * np.sqrt(variance[n:])
     if correlated.mean() > _WHITE_SHARE or not alike_neighbours(rows).any():
@@ -184,16 +185,16 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
     # of these is more than chance.
     if rows.inputs.constant.all() or len(rows) < 2:
         return np.zeros(len(rows.scatter()), dtype=bool)
-    each, other = neighbours(rows)
-    difference = np.mean((each.targets - other.targets) ** 2, axis=0)
-    return difference < 2.0 * each.targets.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(each.inputs)))
+    sampled, nearest = neighbours(rows)
+    difference = np.mean((sampled.targets - nearest.targets) ** 2, axis=0)
+    return difference < 2.0 * sampled.targets.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(sampled.inputs)))
 
 
 def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawRows]:
     """Up to ``size`` rows of a sample, and the nearest other row of the sample to each, in standard deviations."""
-    some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
-    inputs = (some.inputs - rows.inputs.mean) / rows.inputs.scale
+    sample = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
+    inputs = (sample.inputs - rows.inputs.mean) / rows.inputs.scale
     queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
-    _, nearest = cKDTree(inputs).query(inputs[queried], 2)
-    each, other = (some[own] for own in nearest.T)
-    return each, other
+    _, pairs = cKDTree(inputs).query(inputs[queried], 2)
+    sampled, nearest = (sample[positions] for positions in pairs.T)
+    return sampled, nearest

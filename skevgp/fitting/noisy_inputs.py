@@ -40,13 +40,13 @@ def fit_to_noisy_inputs(
     before, weights = None, row_weights(data.chosen, data.source.n_rows)
     for _ in range(_TURNS):
         by_inputs, squares = look_at_slopes(posterior_of(fitted), data, numbers, covariance, base)
-        each = zip(squares.T, by_inputs.T, strict=True)
-        own = np.array([own_variance(*of_output, *weights) for of_output in each])
-        if before is not None and (np.abs(np.log(own / before)) < _SETTLED).all():
+        outputs = zip(squares.T, by_inputs.T, strict=True)
+        noise = np.array([own_variance(*of_output, *weights) for of_output in outputs])
+        if before is not None and (np.abs(np.log(noise / before)) < _SETTLED).all():
             break
-        before = own
+        before = noise
         least = _LEAST_SHARE * np.average(by_inputs, axis=0, weights=weights[0])
-        fitted = refit(relative_noise(by_inputs, np.maximum(own, least), data.chosen), fitted)
+        fitted = refit(relative_noise(by_inputs, np.maximum(noise, least), data.chosen), fitted)
         if monitor.stopped or monitor.out_of_time:
             break
     return fitted
@@ -60,15 +60,15 @@ def look_at_slopes(
     positions = np.arange(len(numbers)) if chosen.positions is None else chosen.positions
     variances, squares = [], []
     for first in range(0, len(positions), _ROWS_AT_ONCE):
-        own = positions[first : first + _ROWS_AT_ONCE]
-        some = np.asarray(numbers[own], dtype=np.float64)
+        indices = positions[first : first + _ROWS_AT_ONCE]
+        X = np.asarray(numbers[indices], dtype=np.float64)
         # The maps are checked here, because the compiled posterior checks nothing.
-        posterior.maps.rows(data.given, numbers, own)
-        slopes: Any = fast.value_and_jacobian(some)[1].reshape(len(some), -1, some.shape[1])
+        posterior.maps.rows(data.given, numbers, indices)
+        slopes: Any = fast.value_and_jacobian(X)[1].reshape(len(X), -1, X.shape[1])
         if base is not None:
             # If y is a difference to columns of X, the noise of these is in y too.
             slopes[:, np.arange(len(base)), base] += 1.0
         variances.append(np.einsum("noi,ij,noj->no", slopes, covariance, slopes, optimize=True))
-        mean, std = (part.reshape(len(some), -1) for part in fast.predict(some, return_std=True))
-        squares.append((data.y[own].reshape(mean.shape) - mean) ** 2 + std**2)
+        mean, std = (part.reshape(len(X), -1) for part in fast.predict(X, return_std=True))
+        squares.append((data.y[indices].reshape(mean.shape) - mean) ** 2 + std**2)
     return np.concatenate(variances), np.concatenate(squares)

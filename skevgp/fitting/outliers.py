@@ -48,8 +48,8 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
     weighed = replace(weighed, max_iter=model.max_iter)
     with model.monitor.keeping_the_best():
         while not model.monitor.stopped:
-            weighed, settled, now = settle(weighed, fit, rows, doubts)
-            moved, fit, doubts = now.differ_from(doubts), settled, now
+            weighed, settled, new_doubts = settle(weighed, fit, rows, doubts)
+            moved, fit, doubts = new_doubts.differ_from(doubts), settled, new_doubts
             if fit.n_iter >= model.max_iter or (fit.converged and not moved):
                 break
             until = min(fit.n_iter + _BETWEEN, model.max_iter)
@@ -86,8 +86,9 @@ def _first_doubts(model: Model) -> RowDoubts:
     plain = _first_of(look_at(rows, predictor_at(every, from_plain)), robust.scales)
     if neighbours.together(robust.rejected) > _TOGETHER:
         return plain
-    found = _evidence(short, rows, chosen, robust, from_robust), _evidence(short, rows, chosen, plain, from_plain)
-    return robust if found[0] > found[1] else plain
+    evidence_of_robust = _evidence(short, rows, chosen, robust, from_robust)
+    evidence_of_plain = _evidence(short, rows, chosen, plain, from_plain)
+    return robust if evidence_of_robust > evidence_of_plain else plain
 
 
 def _evidence(model: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts, values: Values) -> float:
@@ -110,9 +111,9 @@ def _robust_doubts(short: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoub
     seen = doubts.without_outliers(doubts.weigh(rows))
     values: Values | None = None
     for turn in range(_LOOKS):
-        own = replace(short, rows=seen.subset(chosen))
-        fit = search(own) if values is None else own.minimise(Start(values, short.max_iter))
-        look, values = look_at(rows, predictor_at(own, fit.values)), fit.values
+        model = replace(short, rows=seen.subset(chosen))
+        fit = search(model) if values is None else model.minimise(Start(values, short.max_iter))
+        look, values = look_at(rows, predictor_at(model, fit.values)), fit.values
         if turn == 0:
             # The pulled fit shifts the errors of all other rows.
             far = look.far_from_median(_FAR_FROM_MEDIAN)

@@ -176,8 +176,8 @@ def resolved(
         parts = list(_parts(feature_map, safe_indexing(X, slice(0, 1)), np.arange(shape[1])))
     mean, scale, correlation = np.zeros(shape), np.full(shape, np.nan), _independent(shape)
     for part in parts:
-        own = shape[0], len(part.columns)
-        part_mean, part_scale, part_correlation = _own_prior(part.feature_map, n_outputs, own)
+        part_shape = shape[0], len(part.columns)
+        part_mean, part_scale, part_correlation = _own_prior(part.feature_map, n_outputs, part_shape)
         mean[:, part.columns] = part_mean / part.weight
         scale[:, part.columns] = part_scale / abs(part.weight)
         correlation[:, part.columns[:, np.newaxis], part.columns] = part_correlation
@@ -204,7 +204,7 @@ def resolved(
     mean, scale = mean.astype(float), scale.astype(float)
     if (correlation == _independent(shape)).all():
         return Resolved(mean, scale, None, groups)
-    root = np.array([root_of_correlation(own, labels) for own, labels in zip(correlation, groups, strict=True)])
+    root = np.array([root_of_correlation(matrix, labels) for matrix, labels in zip(correlation, groups, strict=True)])
     return Resolved(mean, scale, scale[:, :, np.newaxis] * root, groups)
 
 
@@ -222,16 +222,18 @@ def _in_units_of_data(scale: np.ndarray, mean: np.ndarray, parts: Sequence[_Part
     for part in asking:
         # A feature that is 0 on all rows has no size. Its weight may have any scale.
         size = data.size[..., part.columns] / abs(part.weight)
-        found = as_floats(part.feature_map.coef_scale(left_over, np.where(size > 0.0, size, 1.0)), "A scale of a map")
+        part_scale = as_floats(
+            part.feature_map.coef_scale(left_over, np.where(size > 0.0, size, 1.0)), "A scale of a map"
+        )
         allowed = _shapes((len(mean), len(part.columns)))
-        if found.shape not in allowed:
+        if part_scale.shape not in allowed:
             raise ValueError(
                 f"coef_scale of {part.feature_map!r} must return standard deviations of the shape {allowed[0]}; got "
-                f"{found.shape}."
+                f"{part_scale.shape}."
             )
-        found = found.reshape(allowed[0]) / abs(part.weight)
+        part_scale = part_scale.reshape(allowed[0]) / abs(part.weight)
         missing = np.isnan(scale[:, part.columns])
-        scale[:, part.columns] = np.where(missing, found, scale[:, part.columns])
+        scale[:, part.columns] = np.where(missing, part_scale, scale[:, part.columns])
     return scale
 
 
@@ -272,14 +274,14 @@ def root_of_correlation(correlation: np.ndarray, groups: np.ndarray) -> np.ndarr
     """A C (p, p) with C Cᵀ = ``correlation``, in which weights of different groups have nothing in common."""
     root = np.zeros(correlation.shape)
     for group in dict.fromkeys(groups):
-        own = np.flatnonzero(groups == group)
-        if correlation[own][:, groups != group].any():
+        members = np.flatnonzero(groups == group)
+        if correlation[members][:, groups != group].any():
             raise ValueError(
                 f"Weights of different groups must be independent; those of the group {group!r} are correlated with "
                 "others. CoefPrior(groups=None) keeps all scales."
             )
-        eigenvalues, vectors = eigh(correlation[np.ix_(own, own)])
-        root[np.ix_(own, own)] = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+        eigenvalues, vectors = eigh(correlation[np.ix_(members, members)])
+        root[np.ix_(members, members)] = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     return root
 
 
@@ -293,9 +295,9 @@ def _of_covariance(covariance: ArrayLike, name: str, shape: tuple[int, int]) -> 
     k, p = shape
     values = as_floats(covariance, name)
     if values.shape not in ((p, p), (k, p, p)):
-        each = f", or one such for each output, {(k, p, p)}" if k > 1 else ""
+        alternative = f", or one such for each output, {(k, p, p)}" if k > 1 else ""
         raise ValueError(
-            f"{name} must be of the shape (n_features_out, n_features_out) = {(p, p)}{each}; got the shape "
+            f"{name} must be of the shape (n_features_out, n_features_out) = {(p, p)}{alternative}; got the shape "
             f"{values.shape}."
         )
     values = np.broadcast_to(values, (k, p, p))
@@ -364,17 +366,17 @@ def wide_scale(
     o, p = len(target_size), triangles.shape[-1]
     size = np.where(target_size > 0.0, target_size, 1.0)
     of_zeros = size.max() if shared else size[:, np.newaxis]
-    each = np.broadcast_to(triangles, (o, *triangles.shape[1:]))
-    alone = size[:, np.newaxis] / np.where((rms := _sizes(each) / np.sqrt(n_rows)) > 0.0, rms, np.inf)
+    triangles = np.broadcast_to(triangles, (o, *triangles.shape[1:]))
+    alone = size[:, np.newaxis] / np.where((rms := _sizes(triangles) / np.sqrt(n_rows)) > 0.0, rms, np.inf)
     if shared:
         alone = alone.max(axis=0, keepdims=True)
     if moderate:
         return _MODERATE * np.where(alone > 0.0, alone, of_zeros)
     if shared:
         # The rows of all outputs, in units of their targets.
-        each = np.linalg.qr((each / size[:, np.newaxis, np.newaxis]).reshape(-1, p)).R[np.newaxis]
+        triangles = np.linalg.qr((triangles / size[:, np.newaxis, np.newaxis]).reshape(-1, p)).R[np.newaxis]
         n_rows, size = n_rows * o, np.ones(1)
-    largest = np.array([np.sqrt(n_rows) * unit * _dual_sizes(R) for unit, R in zip(size, each, strict=True)])
+    largest = np.array([np.sqrt(n_rows) * unit * _dual_sizes(R) for unit, R in zip(size, triangles, strict=True)])
     largest = np.maximum(largest, alone)
     return _WIDE * np.where(largest > 0.0, largest, of_zeros)
 
@@ -383,21 +385,21 @@ def _sizes(triangles: np.ndarray) -> np.ndarray:
     """√ of the diagonal of RᵀR (..., p)."""
     largest = np.abs(triangles).max(axis=-2, initial=0.0)
     unit = np.where(largest > 0.0, largest, 1.0)
-    found: np.ndarray = unit * np.sqrt(np.sum((triangles / unit[..., np.newaxis, :]) ** 2, axis=-2))
-    return np.where(largest > 0.0, found, 0.0)
+    sizes: np.ndarray = unit * np.sqrt(np.sum((triangles / unit[..., np.newaxis, :]) ** 2, axis=-2))
+    return np.where(largest > 0.0, sizes, 0.0)
 
 
 def _dual_sizes(R: np.ndarray) -> np.ndarray:
     """√ of the diagonal (p,) of (RᵀR)⁺, without digits that rounding may have changed. 0 for a column of zeros."""
     sizes = _sizes(R)
     seen = sizes > 0.0
-    found = np.zeros(len(sizes))
+    dual_sizes = np.zeros(len(sizes))
     if seen.any():
         _, values, vectors = svd(R[:, seen] / sizes[seen], full_matrices=False, lapack_driver="gesvd")
         kept = values > _COLLINEAR * values[0]
         by = np.maximum(values[kept], _INDEPENDENT * values[0])
-        found[seen] = np.sqrt(np.sum((vectors[kept] / by[:, np.newaxis]) ** 2, axis=0)) / sizes[seen]
-    return found
+        dual_sizes[seen] = np.sqrt(np.sum((vectors[kept] / by[:, np.newaxis]) ** 2, axis=0)) / sizes[seen]
+    return dual_sizes
 
 
 class _Part(NamedTuple):
@@ -421,8 +423,8 @@ def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") ->
             yield from _parts(steps[-1], first, columns, name)
     else:
         for part in parts_of_union(feature_map, first):
-            own_name = f"{name}: {part.name}" if name else part.name
-            for inner in _parts(part.transformer, part.rows, columns[part.columns], own_name):
+            part_name = f"{name}: {part.name}" if name else part.name
+            for inner in _parts(part.transformer, part.rows, columns[part.columns], part_name):
                 yield inner._replace(weight=part.weight * inner.weight)
 
 

@@ -79,17 +79,17 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
     fits = _ShortFits.of(problem, rng, monitor)
     if fits.n_free == 0:
         return [everything]
-    found = side_by_side(fits.alone, everything, problem.n_threads, monitor)
-    own = np.array([fits.bound(o, values) for o, values in enumerate(found)])
+    values_by_output = side_by_side(fits.alone, everything, problem.n_threads, monitor)
+    bounds_alone = np.array([fits.bound(o, values) for o, values in enumerate(values_by_output)])
     # An own kernel has more parameters, and each must gain ½ log n nats (Schwarz 1978). If an output gains less, the
     # sample says nothing about it.
-    gain, chance = own - fits.without, 0.5 * fits.n_free * np.log(fits.n_rows)
+    gain, chance = bounds_alone - fits.without, 0.5 * fits.n_free * np.log(fits.n_rows)
     bearable = np.maximum(_LARGEST_LOSS * gain, chance)
     learned = [o for o in everything if gain[o] > chance]
 
     def suits(outputs: list[int], shared: list[Values]) -> bool:
         bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
-        return bool((own[outputs] - bounds <= bearable[outputs]).all())
+        return bool((bounds_alone[outputs] - bounds <= bearable[outputs]).all())
 
     # Rows outside of the sample may say more. Other outputs must not dominate its kernel then: it has its own group.
     unknown = [o for o in everything if o not in learned]
@@ -99,15 +99,15 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
     constant = [o for o in unknown if o not in (*hidden, *still)]
 
     def completed(groups: list[list[int]]) -> list[list[int]]:
-        return [sorted([*groups[0], *constant]), *groups[1:], *(own for own in (hidden, still) if own)]
+        return [sorted([*groups[0], *constant]), *groups[1:], *(group for group in (hidden, still) if group)]
 
     if not learned:
-        return [own for own in ([o for o in everything if o not in still], still) if own]
+        return [group for group in ([o for o in everything if o not in still], still) if group]
     if suits(learned, fits.further(learned, fits.together)):
         return completed([learned])
     groups, apart = [[o] for o in learned], np.eye(len(everything), dtype=bool)
     while True:
-        shapes = [fits.shape(found[group[0]]) for group in groups]
+        shapes = [fits.shape(values_by_output[group[0]]) for group in groups]
         pairs = [
             (float(shapes[i] @ shapes[j]), i, j)
             for i, j in combinations(range(len(groups)), 2)
@@ -117,12 +117,12 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
             return completed(groups)
         _, i, j = max(pairs)
         outputs = sorted(groups[i] + groups[j])
-        shared = fits.further(outputs, found)
+        shared = fits.further(outputs, values_by_output)
         if suits(outputs, shared):
             groups[i] = outputs
             del groups[j]
             for o, values in zip(outputs, shared, strict=True):
-                found[o] = values
+                values_by_output[o] = values
         else:
             apart[np.ix_(groups[i], groups[j])] = True
 
@@ -182,10 +182,10 @@ class _ShortFits:
     def further(self, outputs: list[int], starts: list[Values]) -> list[Values]:
         """The values of some outputs that continue together, from the mean of their kernels."""
         others = [[o] for o in range(len(starts)) if o not in outputs]
-        (model,) = (own for own in self._planned([outputs, *others]) if own.rows.columns == outputs)
-        own = [starts[o] for o in outputs]
-        values = {name: np.concatenate([one[name] for one in own]) for name in _PER_OUTPUT if name in own[0]}
-        values["hyperparameters"] = np.exp(np.mean([np.log(one["hyperparameters"]) for one in own], axis=0))
+        (model,) = (model for model in self._planned([outputs, *others]) if model.rows.columns == outputs)
+        chosen = [starts[o] for o in outputs]
+        values = {name: np.concatenate([start[name] for start in chosen]) for name in _PER_OUTPUT if name in chosen[0]}
+        values["hyperparameters"] = np.exp(np.mean([np.log(start["hyperparameters"]) for start in chosen], axis=0))
         return _short_fit(model, model.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
 
     def bound(self, output: int, values: Values) -> float:
@@ -219,5 +219,5 @@ def _short_fit(model: Model, table: ParameterTable, n_iter: int, monitor: Monito
     tolerance = Tolerance(_SHORT_TOL / model.rows.total)
     minimum = LBFGS().minimise(model.objective(table), table.start(), table.limits(), n_iter, tolerance, monitor)
     values = table.values(minimum.x)
-    each = range(len(values["noise"]))
-    return [values | {name: values[name][[o]] for name in _PER_OUTPUT if name in values} for o in each]
+    outputs = range(len(values["noise"]))
+    return [values | {name: values[name][[o]] for name in _PER_OUTPUT if name in values} for o in outputs]

@@ -22,7 +22,7 @@ _FACTOR_LIMITS = 1e-4, 1e4
 
 def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, ...]:
     """The kernel with the centre of its inputs. One for each output that has its own inputs."""
-    return tuple(covariance.centred(own) for own in np.atleast_2d(inputs.centre))
+    return tuple(covariance.centred(centre) for centre in np.atleast_2d(inputs.centre))
 
 
 def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
@@ -75,8 +75,9 @@ def starting_table(
     units, starts, rules = problem.units, problem.spec.starts, problem.rules
     if exact and rules.lowest_noise_exact is not None:
         rules = replace(rules, lowest_noise=rules.lowest_noise_exact)
-    inputs, own, precision, scatter = rows.inputs, rows.columns, rows.mean_precision, rows.scatter()
-    target_unit, constant, rounding = units.target_unit[own], units.constant[own], units.rounding[own]
+    inputs, columns = rows.inputs, rows.columns
+    precision, scatter = rows.mean_precision, rows.scatter()
+    target_unit, constant, rounding = units.target_unit[columns], units.constant[columns], units.rounding[columns]
     o, scale = np.ones(len(target_unit)), inputs.scale
     # Outputs may have their own columns, and groups of outputs their own kernels.
     typical = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale
@@ -117,7 +118,7 @@ def starting_table(
                 lowest_noise,
                 highest,
                 target_unit**2,
-                np.maximum(highest, units.target_scatter[own] * precision),
+                np.maximum(highest, units.target_scatter[columns] * precision),
                 still and starts.noise.value is None,
             ),
             *factors,
@@ -181,19 +182,19 @@ def prior_predictor(rows: Rows, spec: KernelSpec, prior: CoefficientPrior) -> Pr
     noise = np.zeros(o) if starts.noise.value is None else np.repeat(starts.noise.value, o)
     nowhere, groups = np.empty((0, rows.inputs.mean.shape[-1])), []
     for index in range(o):
-        own, kernel = slice(index, index + 1), kernels[index % len(kernels)]
-        checked_variance(kernel, hyperparameters, rows.some(np.zeros(1, dtype=int)).of(own).inputs)
+        outputs, kernel = slice(index, index + 1), kernels[index % len(kernels)]
+        checked_variance(kernel, hyperparameters, rows.some(np.zeros(1, dtype=int)).of(outputs).inputs)
         groups.append(
             PredictorGroup.of(
-                own,
-                kernel,
-                hyperparameters,
-                nowhere,
-                Whitening.of(kernel, hyperparameters, nowhere),
-                signal[own],
-                prior.outputs(own),
-                [np.zeros(p)],
-                [np.eye(p) if p else np.zeros((1, 0))],
+                outputs=outputs,
+                kernel=kernel,
+                hyperparameters=hyperparameters,
+                points=nowhere,
+                whitening=Whitening.of(kernel, hyperparameters, nowhere),
+                signal=signal[outputs],
+                prior=prior.outputs(outputs),
+                mean=[np.zeros(p)],
+                root=[np.eye(p) if p else np.zeros((1, 0))],
             )
         )
     return Predictor(tuple(groups), noise, prior.mean, np.zeros(o), prior.shared)

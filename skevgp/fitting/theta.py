@@ -135,7 +135,7 @@ class ThetaPosterior:
 
     def z_under(self, priors: Sequence[Prior]) -> np.ndarray:
         """The coordinates (q,) of the mean under other priors of the same parameters."""
-        return np.array([p.coordinate(own) for p, own in zip(priors, self.theta.values(self.mean), strict=True)])
+        return np.array([p.coordinate(value) for p, value in zip(priors, self.theta.values(self.mean), strict=True)])
 
     def attributes(self) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
         """Posterior medians and standard deviations by name, and the covariance (q, q) of the parameters."""
@@ -160,7 +160,7 @@ class ThetaPosterior:
         return np.sqrt(np.diagonal(self.covariance)) > _UNIDENTIFIED
 
     def _named(self, chosen: np.ndarray) -> list[str]:
-        return [name for name, own in zip(self.theta.names, chosen, strict=True) if own]
+        return [name for name, is_chosen in zip(self.theta.names, chosen, strict=True) if is_chosen]
 
     def intervals(self, probability: float = 0.95) -> dict[str, tuple[float, float]]:
         """A credible interval of each parameter. It stays within the bounds of the prior."""
@@ -208,11 +208,11 @@ def extended(prior: CoefficientPrior, step: ThetaStep) -> CoefficientPrior:
     for output in range(o):
         # Shared weights have one posterior, and all of the information is in the first output.
         from_others, deviation = step.cavity(0 if prior.shared else output)
-        own = slice(p, p + len(active))
+        columns = slice(p, p + len(active))
         W, widths, K = deviation.W[np.ix_(active, active)], deviation.widths[active], step.K[output][:, active]
         mean[output, p:] = K @ from_others[active]
-        root[output, p:, own] = K @ (W * widths)
-        reference[output, own] = -(W.T @ from_others[active]) / widths
+        root[output, p:, columns] = K @ (W * widths)
+        reference[output, columns] = -(W.T @ from_others[active]) / widths
     scale[...] = np.sqrt(np.square(root).sum(axis=2))
     groups = None if prior.groups is None else np.hstack([prior.groups, np.full((o, d), -1)])
     return CoefficientPrior(mean, scale, reference, root, prior.shared, prior.labels, groups)
@@ -299,9 +299,10 @@ class _Calibrator:
 
     def nonlinearity(self, before: ThetaStep, after: ThetaStep) -> np.ndarray:
         """Mean squared error (o,) of the features at a value of z, linearised at another."""
-        then, now, p = self.features(before.z), self.features(after.z), self.p
-        moved = times_weights(now[..., :p] - then[..., :p], after.beta)
-        moved -= times_weights(then[..., p:], after.K @ (after.z - before.z))
+        features_before, features_after = self.features(before.z), self.features(after.z)
+        p = self.p
+        moved = times_weights(features_after[..., :p] - features_before[..., :p], after.beta)
+        moved -= times_weights(features_before[..., p:], after.K @ (after.z - before.z))
         return np.mean(moved**2, axis=0)
 
     def at(self, z: np.ndarray) -> ThetaStep:
@@ -319,15 +320,15 @@ class _Calibrator:
         n_tried = int(np.ceil(np.log2(min(_TRIED * q, _MOST_TRIED))))
         tried = ndtri(qmc.Sobol(q, seed=seed).random_base2(n_tried))
         noise = self.noise_at(np.zeros(q))
-        found = [self.improved(np.zeros(q), noise)]
+        optima = [self.improved(np.zeros(q), noise)]
         values = [self.value_alone(z, noise) for z in tried]
         best = [tried[i] for i in np.argsort(values)[::-1][:_IMPROVED] if np.isfinite(values[i])]
-        found += [self.improved(z, noise) for z in best]
+        optima += [self.improved(z, noise) for z in best]
         # Minus twice the log evidence with the noise variance of the residuals.
-        loss = [len(self.targets) * float(np.log(own).sum()) + float(step.z @ step.z) for step, own in found]
+        loss = [len(self.targets) * float(np.log(variance).sum()) + float(step.z @ step.z) for step, variance in optima]
         distinct: list[ThetaStep] = []
-        for step, own in (found[i] for i in np.argsort(loss)):
-            as_good = (own <= _AS_GOOD**2 * found[int(np.argmin(loss))][1]).all()
+        for step, variance in (optima[i] for i in np.argsort(loss)):
+            as_good = (variance <= _AS_GOOD**2 * optima[int(np.argmin(loss))][1]).all()
             if as_good and all(np.abs(step.z - other.z).max() > _APART for other in distinct):
                 distinct.append(step)
         return distinct[:_STARTS]
@@ -407,14 +408,14 @@ def climbed(step: ThetaStep, step_at: StepAt) -> ThetaStep:
         if length < _SETTLED:
             break
         for _ in range(_HALVINGS):
-            there = step_at(step.z + share * move, step)
-            if there is not None and (there.value > step.value or _length(there.newton(), there) < 0.5 * length):
+            trial = step_at(step.z + share * move, step)
+            if trial is not None and (trial.value > step.value or _length(trial.newton(), trial) < 0.5 * length):
                 break
             share /= 2.0
         else:
             break
-        assert there is not None
-        step = there
+        assert trial is not None
+        step = trial
     return step
 
 
@@ -469,21 +470,23 @@ def calibrate(
             f'A feature map with parameters ({", ".join(theta.names)}) needs solver="lbfgs" or an LBFGS(...) with '
             f'posterior="full", and Gaussian noise of y only; got solver={solver!r} and noise={noise!r}.'
         )
-    own = _Calibrator(data, problem, theta)
+    calibrator = _Calibrator(data, problem, theta)
     fitted, before = previous
     seed, goes_on = rng.randint(np.iinfo(np.int32).max), False
     if before is not None and before.theta.names == theta.names:
-        goes_on, starts = True, [own.at(before.z_under(theta.priors))]
+        goes_on, starts = True, [calibrator.at(before.z_under(theta.priors))]
     else:
-        fitted, starts = None, own.starts(seed)
+        fitted, starts = None, calibrator.starts(seed)
     step, best = starts[0], -np.inf
     for number, start in enumerate(starts if len(starts) > 1 else (), start=1):
-        rough = fit(own.problem_at(start, own.data_at(start.z)), None, True, f"parameters, start {number}")
+        rough = fit(
+            calibrator.problem_at(start, calibrator.data_at(start.z)), None, True, f"parameters, start {number}"
+        )
         if monitor.stopped or monitor.out_of_time:
             break
-        start = own.settled(start, rough)
-        bound = own.finished(start, own.data_at(start.z), rough).lower_bound
-        bound -= 0.0 if own.together else start.counted_twice()
+        start = calibrator.settled(start, rough)
+        bound = calibrator.finished(start, calibrator.data_at(start.z), rough).lower_bound
+        bound -= 0.0 if calibrator.together else start.counted_twice()
         if bound > best:
             best, step, fitted = bound, start, rough
     # Without a fit of the noise, the optimum of the features alone is better than a step under a first guess.
@@ -491,24 +494,24 @@ def calibrate(
     trusted = True
     for number in range(1, _FITS + 1):
         at_start = step
-        problem = own.problem_at(step, own.data_at(step.z))
+        problem = calibrator.problem_at(step, calibrator.data_at(step.z))
         fitted = fit(problem, fitted, False, f"parameters, fit {number}")
         ended = monitor.stopped or monitor.out_of_time
         trusted = noise_known and not ended
         if trusted:
-            step = own.settled(step, fitted)
+            step = calibrator.settled(step, fitted)
         ended = ended or problem.max_iter == 0
-        if ended or (own.nonlinearity(at_start, step) < _NONLINEAR**2 * fitted.predictor().noise).all():
+        if ended or (calibrator.nonlinearity(at_start, step) < _NONLINEAR**2 * fitted.predictor().noise).all():
             break
     assert fitted is not None
-    at_mode = own.data_at(step.z)
-    found = Theta.of(at_mode.maps.feature_map.feature_map)
-    assert found is not None
-    bend = own.bend(step, fitted) if problem.variant.orthogonal and trusted else None
-    posterior = ThetaPosterior.of(found, step, own.together, bend)
+    at_mode = calibrator.data_at(step.z)
+    theta_at_mode = Theta.of(at_mode.maps.feature_map.feature_map)
+    assert theta_at_mode is not None
+    bend = calibrator.bend(step, fitted) if problem.variant.orthogonal and trusted else None
+    posterior = ThetaPosterior.of(theta_at_mode, step, calibrator.together, bend)
     if not trusted or _length(step.newton(), step) > _MOVED:
         posterior = replace(posterior, mean=step.z)
-    return Calibration(at_mode, problem, own.finished(step, at_mode, fitted), posterior)
+    return Calibration(at_mode, problem, calibrator.finished(step, at_mode, fitted), posterior)
 
 
 def rough_tol(problem: Problem) -> float:
@@ -525,5 +528,5 @@ def after_more_rows(
     z = posterior.theta.coordinates()
     step = theta_step(fitted.weight_likelihoods(), prior, linearized.columns, z)
     together = prior.shared or fitted.models[0].posterior.sparse.variant.orthogonal
-    found = ThetaPosterior.of(posterior.theta, step, together, posterior.bend)
-    return found, fitted.reweighted(extended(prior, step))
+    updated = ThetaPosterior.of(posterior.theta, step, together, posterior.bend)
+    return updated, fitted.reweighted(extended(prior, step))

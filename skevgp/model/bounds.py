@@ -97,13 +97,13 @@ class Group:
         if self.variant.orthogonal and not transposed:
             A = A.copy()
             A[m:] -= self.leaks[index] @ A[:m]
-        found = (self.scales[index] * A.T).T
+        product = (self.scales[index] * A.T).T
         if self.prior.root is not None:
             C = self.prior.root[index]
-            found[m:] = (C.T if transposed else C) @ A[m:]
+            product[m:] = (C.T if transposed else C) @ A[m:]
         if self.variant.orthogonal and transposed:
-            found[:m] -= self.leaks[index].T @ found[m:]
-        return found
+            product[:m] -= self.leaks[index].T @ product[m:]
+        return product
 
     # A discrepancy f that is orthogonal to the features has the kernel k⊥ = k - k_h G⁻¹ k_hᵀ of Plumlee (2017), here
     # with sums over the rows: f⊥ = f - A (AᵀA)⁺ Aᵀ f(X) on the rows, A = H C. With f = s Vᵀ v, f⊥ is the same function
@@ -113,13 +113,13 @@ class Group:
     @cached_property
     def leaks(self) -> list[np.ndarray]:
         """The matrix (p, m) of each output that maps v to the weights of the best fit of f by the features."""
-        statistics, found = self.statistics, []
+        statistics, leaks = self.statistics, []
         for output, signal in enumerate(self.signal):
             C = self.prior.roots()[output]
             AA, AV = C.T @ statistics.HH @ C, C.T @ statistics.VH.T
             sizes = np.square(C).T @ diagonal_of(statistics.HH)
-            found.append(np.sqrt(signal) * (semidefinite_inverse(AA, sizes) @ AV))
-        return found
+            leaks.append(np.sqrt(signal) * (semidefinite_inverse(AA, sizes) @ AV))
+        return leaks
 
     def orthogonalised(self, index: int, crossed: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V⊥ V⊥ᵀ (m, m) and V⊥ [H, r] of an output, from V [H, r] and Hᵀ [H, r], where V⊥ has no part along A."""
@@ -178,9 +178,9 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
     """
     if groups[0].prior.shared:
         return _with_shared_weights(groups)
-    found = []
+    posteriors = []
     for group in groups:
-        m, own = len(group.statistics.VV), []
+        m, posteriors_of_group = len(group.statistics.VV), []
         for o, noise in enumerate(group.noise):
             # B = I + σ⁻² PᵀP (m + p, m + p) and g = σ⁻² Pᵀr - (0, w₀) (m + p,). With B = R Rᵀ, the mean is R⁻ᵀ R⁻¹ g.
             B, g = group.products(o)
@@ -190,9 +190,9 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
             g[m:] -= group.prior.reference[o]
             root = jittered_cholesky(B, sizes=group.sizes(o))
             root_inv = triangular_inverse(root)
-            own.append(WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g), len(B)))
-        found.append(own)
-    return found
+            posteriors_of_group.append(WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g), len(B)))
+        posteriors.append(posteriors_of_group)
+    return posteriors
 
 
 def _with_shared_weights(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]:
@@ -209,7 +209,7 @@ def _with_shared_weights(groups: Sequence[Group]) -> list[list[WhitenedPosterior
     # so that log|B| = Σ log|D_j| + log|S|, and the precision of (v_j, w) is [D_j, E_j; E_jᵀ, S + E_jᵀ D_j⁻¹ E_j]. The
     # inverses of these contain all of B⁻¹ that predictions, the gradient of the bound and covariances of outputs need.
     p = groups[0].prior.scale.shape[1]
-    each, S, sizes, g_w = [], np.eye(p), np.ones(p), -groups[0].prior.reference[0]
+    parts, S, sizes, g_w = [], np.eye(p), np.ones(p), -groups[0].prior.reference[0]
     for group in groups:
         m = len(group.statistics.VV)
         for o, noise in enumerate(group.noise):
@@ -224,14 +224,14 @@ def _with_shared_weights(groups: Sequence[Group]) -> list[list[WhitenedPosterior
             S += PP[m:, m:] - A.T @ A
             sizes += diagonal_of(PP)[m:]
             g_w += g[m:] - A.T @ z
-            each.append((PP, D_root, D_root_inv, A, z))
+            parts.append((PP, D_root, D_root_inv, A, z))
     S_root = jittered_cholesky(S, sizes=sizes)
     # S includes the jitter, if there is one.
     S = S_root @ S_root.T
     S_root_inv = triangular_inverse(S_root)
     w = S_root_inv.T @ (S_root_inv @ g_w)
-    found = []
-    for index, (B, D_root, D_root_inv, A, z) in enumerate(each):
+    posteriors = []
+    for index, (B, D_root, D_root_inv, A, z) in enumerate(parts):
         # The Cholesky factor of the precision of (v_j, w) is [R, 0; Aᵀ, S_root].
         m = len(D_root)
         B[m:, m:] = S + A.T @ A
@@ -241,8 +241,8 @@ def _with_shared_weights(groups: Sequence[Group]) -> list[list[WhitenedPosterior
         root_inv[m:, :m] = -S_root_inv @ (A.T @ D_root_inv)
         mean = np.concatenate([D_root_inv.T @ (z - A @ w), w])
         # w counts for the first output.
-        found.append(WhitenedPosterior(B, root, root_inv, mean, m if index else m + p))
-    in_order = iter(found)
+        posteriors.append(WhitenedPosterior(B, root, root_inv, mean, m if index else m + p))
+    in_order = iter(posteriors)
     return [[next(in_order) for _ in group.noise] for group in groups]
 
 
@@ -381,8 +381,8 @@ class BoundAtOptimum:
         # KL[q(β) || p(β)]. With z = w + w₀ the derivative in log c is E[z²] - 1.
         self._factors = mean[:, m:] ** 2 + spread - 1.0
         if group.prior.shared:
-            for own, factors, q in zip(mean, self._factors, posteriors, strict=True):
-                own[q.n_own :] = 0.0
+            for mean_of_output, factors, q in zip(mean, self._factors, posteriors, strict=True):
+                mean_of_output[q.n_own :] = 0.0
                 factors[q.n_own - m :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
         # (o,) each: the bound without eᵀe, and its derivatives in log s² and log σ².
@@ -413,29 +413,30 @@ class BoundAtOptimum:
         """The bound, and its gradients in the logarithms of s² (o,), σ² (o,) and factors of scales (o, g)."""
         signal = self._log_signal + 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
         noise = self._log_noise + 0.5 * residuals.squares / self.group.noise
-        found = {"signal": signal, "noise": noise}
+        gradients = {"signal": signal, "noise": noise}
         if self.group.prior.n_groups:
-            found["coef_factors"] = self.group.prior.of_groups(self._factors)
-        return self.value(residuals), found
+            gradients["coef_factors"] = self.group.prior.of_groups(self._factors)
+        return self.value(residuals), gradients
 
 
 def equation_errors(group: Group, posteriors: Sequence[WhitenedPosterior], residuals: Residuals) -> list[np.ndarray]:
     """The error ρ = g - B mean (m + p,) of each output, with the residuals under these means."""
     # As ρ = σ⁻² Pᵀe - mean - (0, w₀) it keeps the digits that B, g and the mean have lost (Higham 2002, section 12.1).
-    PE, m, found = np.concatenate([residuals.VE, residuals.HE]), len(residuals.VE), []
+    PE, m = np.concatenate([residuals.VE, residuals.HE]), len(residuals.VE)
+    errors_by_output = []
     for o, q in enumerate(posteriors):
         prior = q.mean + np.concatenate([np.zeros(m), group.prior.reference[o]])
         prior[q.n_own :] = 0.0
-        found.append(group.times_T(o, PE[:, o], transposed=True) / group.noise[o] - prior)
-    return found
+        errors_by_output.append(group.times_T(o, PE[:, o], transposed=True) / group.noise[o] - prior)
+    return errors_by_output
 
 
 def lost_by_rounding(bounds: Sequence[BoundAtOptimum], residuals: Sequence[Residuals]) -> float:
     """The nats ½ ρᵀB⁻¹ρ that bounds lose because rounding moves their means, with ρ of `equation_errors`."""
     halves = []
-    for bound, own in zip(bounds, residuals, strict=True):
-        for q, error in zip(bound.posteriors, equation_errors(bound.group, bound.posteriors, own), strict=True):
-            halves.append(np.split(q.root_inv @ error, [len(own.VE)]))
+    for bound, sums in zip(bounds, residuals, strict=True):
+        for q, error in zip(bound.posteriors, equation_errors(bound.group, bound.posteriors, sums), strict=True):
+            halves.append(np.split(q.root_inv @ error, [len(sums.VE)]))
     of_v, of_w = zip(*halves, strict=True)
     # If outputs share w, its error is the sum over outputs.
     of_w = (np.sum(of_w, axis=0),) if bounds[0].group.prior.shared else of_w
@@ -475,10 +476,10 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     # The log likelihood with the noise variance σ² + t, with the determinant for σ².
     bounds = bounds_at_optimum(wide)
     residuals = [bound.residuals(blocks) for bound in bounds]
-    total = sum(bound.value(own) for bound, own in zip(bounds, residuals, strict=True))
+    total = sum(bound.value(sums) for bound, sums in zip(bounds, residuals, strict=True))
     total += lost_by_rounding(bounds, residuals)
     log_det = log_ratio + sum(q.log_det for bound in bounds for q in bound.posteriors)
-    log_det -= sum(q.log_det for own in optimal_posteriors(groups) for q in own)
+    log_det -= sum(q.log_det for posteriors in optimal_posteriors(groups) for q in posteriors)
     return total + 0.5 * log_det
 
 
@@ -491,8 +492,19 @@ def bounds_alone(sums: LinearSums, prior: CoefficientPrior, noise: np.ndarray, t
     VV, VH, VR = np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, 1))
     for index, (variance, unexplained) in enumerate(zip(noise, trace, strict=True)):
         output = slice(index, index + 1)
-        products = VV, VH, VR, *sums.of(output)
-        statistics = SufficientStatistics(sums.n_rows, *products, float(unexplained), sums.log_variance, sums.surplus)
+        HH, HR, RR = sums.of(output)
+        statistics = SufficientStatistics(
+            n_rows=sums.n_rows,
+            VV=VV,
+            VH=VH,
+            VR=VR,
+            HH=HH,
+            HR=HR,
+            RR=RR,
+            unexplained=float(unexplained),
+            log_variance=sums.log_variance,
+            surplus=sums.surplus,
+        )
         whitening = Whitening(None, VV, VV)
         groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), prior.outputs(output)))
     return np.array([bound.value(bound.residuals()) for bound in bounds_at_optimum(groups)])

@@ -90,15 +90,15 @@ class OutputGivenKernel:
         """Compute the weights w that some outputs share, from all of their rows."""
         proper, reference = ~outputs[0].vague, outputs[0].reference
         # [W; D] w = [z; -D w₀] by least squares.
-        Q, R = np.linalg.qr(np.vstack([*(own.W for own in outputs), np.diag(proper.astype(float))]))
+        Q, R = np.linalg.qr(np.vstack([*(output.W for output in outputs), np.diag(proper.astype(float))]))
         R_inv = lapack.dtrtri(R)[0] if len(R) else R
-        wanted = Q.T @ np.concatenate([*(own.z for own in outputs), np.where(proper, -reference, 0.0)])
+        wanted = Q.T @ np.concatenate([*(output.z for output in outputs), np.where(proper, -reference, 0.0)])
         # A solve instead of the inverse: features of 1e16 times the noise would multiply the errors of the inverse.
         w = lapack.dtrtrs(R, wanted)[0] if len(R) else wanted
-        for own in outputs:
-            own.R, own.R_inv, own.w, own.is_first = R, R_inv, w, own is outputs[0]
-            own.errors = own.z - own.W @ w
-            own.from_prior = proper * (w + reference)
+        for output in outputs:
+            output.R, output.R_inv, output.w, output.is_first = R, R_inv, w, output is outputs[0]
+            output.errors = output.z - output.W @ w
+            output.from_prior = proper * (w + reference)
 
     @property
     def log_likelihood(self) -> float:
@@ -179,34 +179,34 @@ class ExactModel:
         # I) only. So Rᵀ replaces H, and Qᵀ w₀ replaces w₀. The group's factor multiplies both.
         (o, p), n = self.prior.scale.shape, len(self.rows.inputs)
         groups = np.full((o, p), -1) if self.prior.groups is None else self.prior.groups
-        largest = max(np.count_nonzero(own == group) for own in groups for group in np.unique(own)) if p else 0
+        largest = max(np.count_nonzero(row == group) for row in groups for group in np.unique(row)) if p else 0
         if largest <= n or self.prior.shared or self.vague.any():
             return self
-        found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        reduced: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for index, (scale, w0) in enumerate(zip(self.prior.scale, self.prior.reference, strict=True)):
             H = self.rows.of(slice(index, index + 1)).features
             A = (H * scale if self.prior.root is None else H @ self.prior.root[index]).T
             parts = []
             for group in np.unique(groups[index]):
-                own = np.flatnonzero(groups[index] == group)
-                features, reference = A[own].T, w0[own]
-                if len(own) > n:
+                members = np.flatnonzero(groups[index] == group)
+                features, reference = A[members].T, w0[members]
+                if len(members) > n:
                     # With large rows first, each row keeps its digits (Higham 2002, section 19.4).
-                    own = own[np.argsort(-np.abs(A[own]).max(axis=1))]
-                    Q, R = np.linalg.qr(A[own])
-                    features, reference = R.T, Q.T @ w0[own]
+                    members = members[np.argsort(-np.abs(A[members]).max(axis=1))]
+                    Q, R = np.linalg.qr(A[members])
+                    features, reference = R.T, Q.T @ w0[members]
                 parts.append((features, reference, np.full(len(reference), group)))
             every_feature, every_reference, every_group = zip(*parts, strict=True)
-            found.append(
+            reduced.append(
                 (np.concatenate(every_feature, axis=1), np.concatenate(every_reference), np.concatenate(every_group))
             )
         # Outputs may have different numbers of features: others are 0.
-        width = max(len(reference) for _, reference, _ in found)
+        width = max(len(reference) for _, reference, _ in reduced)
         features, reference = np.zeros((n, o, width)), np.zeros((o, width))
         labels = np.full((o, width), -1)
-        for index, (own_features, own_reference, own_groups) in enumerate(found):
-            k = len(own_reference)
-            features[:, index, :k], reference[index, :k], labels[index, :k] = own_features, own_reference, own_groups
+        for index, (H, w0, groups_of_output) in enumerate(reduced):
+            k = len(w0)
+            features[:, index, :k], reference[index, :k], labels[index, :k] = H, w0, groups_of_output
         prior = CoefficientPrior(
             np.zeros((o, width)),
             np.ones((o, width)),
@@ -221,27 +221,27 @@ class ExactModel:
         """The kernel at the rows, for all outputs or for each, and each output given it."""
         hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
         prior = self.prior.at(values)
-        each = [self.rows.of(slice(output, output + 1)) for output in range(o)]
+        rows_by_output = [self.rows.of(slice(output, output + 1)) for output in range(o)]
         relative = None if self.rows.precision is None else 1.0 / self.rows.precision
         covariances = [
-            kernel.at(hyperparameters, own.inputs)
-            for kernel, own in zip(self.kernels or (self.kernel,), each, strict=False)
+            kernel.at(hyperparameters, rows.inputs)
+            for kernel, rows in zip(self.kernels or (self.kernel,), rows_by_output, strict=False)
         ]
         matrices = [at.matrix() for at in covariances]
         outputs = [
             OutputGivenKernel(
-                matrices[index % len(matrices)],
-                own.features,
-                own.targets[:, 0],
-                values["signal"][index],
-                values["noise"][index],
-                prior.outputs(slice(index, index + 1)),
-                self.vague[index],
-                relative,
+                K=matrices[index % len(matrices)],
+                H=rows.features,
+                r=rows.targets[:, 0],
+                signal=values["signal"][index],
+                noise=values["noise"][index],
+                prior=prior.outputs(slice(index, index + 1)),
+                vague=self.vague[index],
+                relative=relative,
             )
-            for index, own in enumerate(each)
+            for index, rows in enumerate(rows_by_output)
         ]
-        for together in [outputs] if self.prior.shared else [[own] for own in outputs]:
+        for together in [outputs] if self.prior.shared else [[output] for output in outputs]:
             OutputGivenKernel.join(together)
         return covariances, outputs
 
@@ -264,12 +264,12 @@ class ExactModel:
         K_bars = np.zeros((len(covariances), *outputs[0].L.shape))
         for index, output in enumerate(outputs):
             total += output.log_likelihood
-            own, gradient["signal"][index], gradient["noise"][index] = output.gradient()
-            K_bars[index % len(K_bars)] += own
+            K_bar, gradient["signal"][index], gradient["noise"][index] = output.gradient()
+            K_bars[index % len(K_bars)] += K_bar
             if "coef_factors" in values and (output.is_first or not self.prior.shared):
                 # E[z²] - 1 of each weight, as in `bounds.BoundAtOptimum`.
-                each = output.from_prior**2 + (output.R_inv**2).sum(axis=1) - 1.0
-                of_groups = self.prior.outputs(slice(index, index + 1)).of_groups(each[np.newaxis])
+                factors = output.from_prior**2 + (output.R_inv**2).sum(axis=1) - 1.0
+                of_groups = self.prior.outputs(slice(index, index + 1)).of_groups(factors[np.newaxis])
                 gradient["coef_factors"][0 if self.prior.shared else index] += of_groups[0]
         # The factor for copies of rows has the power -Σ (w - 1) / 2 of σ².
         gradient["noise"] -= 0.5 * (self.rows.total - len(self.rows.inputs))
@@ -287,29 +287,29 @@ class ExactModel:
 
     def weight_likelihoods(self, values: Values) -> list[WeightLikelihood]:
         """The likelihood of the weights of each output, with f integrated out."""
-        found = []
+        likelihoods = []
         for index, output in enumerate(self.outputs(values)[1]):
             rows, root_inv = self.rows.of(slice(index, index + 1)), output.L_inv / np.sqrt(output.signal)
-            found.append(likelihood_of_whitened(root_inv @ rows.features, root_inv @ rows.targets[:, 0]))
-        return found
+            likelihoods.append(likelihood_of_whitened(root_inv @ rows.features, root_inv @ rows.targets[:, 0]))
+        return likelihoods
 
     def predictor(self, values: Values, outputs: OutputsGivenKernel | None = None) -> Predictor:
         """The predictor in internal units. Its inducing points are the rows. ``outputs`` are computed if None."""
         covariances, given_kernel = self.outputs(values) if outputs is None else outputs
         groups = []
         for index, output in enumerate(given_kernel):
-            own, (mean, root) = slice(index, index + 1), output.posterior()
+            columns, (mean, root) = slice(index, index + 1), output.posterior()
             groups.append(
                 PredictorGroup.of(
-                    own,
-                    self.kernel if self.kernels is None else self.kernels[index],
-                    values["hyperparameters"],
-                    self.rows.of(own).inputs,
-                    Whitening(covariances[index % len(covariances)], output.L, output.L_inv),
-                    values["signal"][own],
-                    self.prior.at(values).outputs(own),
-                    [mean],
-                    [root],
+                    outputs=columns,
+                    kernel=self.kernel if self.kernels is None else self.kernels[index],
+                    hyperparameters=values["hyperparameters"],
+                    points=self.rows.of(columns).inputs,
+                    whitening=Whitening(covariances[index % len(covariances)], output.L, output.L_inv),
+                    signal=values["signal"][columns],
+                    prior=self.prior.at(values).outputs(columns),
+                    mean=[mean],
+                    root=[root],
                 )
             )
         offset = self.prior.offset

@@ -37,8 +37,16 @@ class SpreadTerms:
 
     @classmethod
     def zeros(cls, m: int, p: int, o: int, k: int) -> SpreadTerms:
-        VV, VH, factor = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
-        return cls(0.0, VV, VH, factor, np.zeros(o), np.zeros(o), np.zeros((o, k)), np.zeros((o, p)))
+        return cls(
+            value=0.0,
+            VV=np.zeros((m, m)),
+            VH=np.zeros((m, p)),
+            factor=np.zeros((m, m)),
+            log_signal=np.zeros(o),
+            log_noise=np.zeros(o),
+            spread=np.zeros((o, k)),
+            log_scale=np.zeros((o, p)),
+        )
 
     def add_output(self, o: int, group: Group, S_v: np.ndarray, rows: np.ndarray, penalty: float) -> None:
         """Add the terms of output o: S_v (m, m + p) of S, the diagonal of σ⁻² PᵀP S (m + p,), and Tr(S) - log|S|."""
@@ -109,14 +117,14 @@ class DiagonalFamily(_GradientFamily):
         half_log_det = np.log(np.diagonal(group.whitening.L)).sum()
         value = 0.5 * (from_data.sum() + from_prior.sum() - log_variance.sum()) + len(d) * half_log_det
         return SpreadTerms(
-            float(value),
-            0.5 * (LD @ LD.T),
-            np.zeros_like(statistics.VH),
-            factor_bar,
-            0.5 * from_data[:, :m].sum(axis=1),
-            -0.5 * from_data.sum(axis=1),
-            0.5 * (from_data + from_prior - 1.0),
-            from_data[:, m:],
+            value=float(value),
+            VV=0.5 * (LD @ LD.T),
+            VH=np.zeros_like(statistics.VH),
+            factor=factor_bar,
+            log_signal=0.5 * from_data[:, :m].sum(axis=1),
+            log_noise=-0.5 * from_data.sum(axis=1),
+            spread=0.5 * (from_data + from_prior - 1.0),
+            log_scale=from_data[:, m:],
         )
 
     def roots(self, values: Values, L_inv: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -55,8 +55,8 @@ class SparseModel:
     def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
         """k̃ of a group, and its hyperparameters (n_hyper,)."""
         hyperparameters = values["hyperparameters"]
-        own = hyperparameters if hyperparameters.ndim == 1 else hyperparameters[group]
-        return self.kernel if self.kernels is None else self.kernels[group], own
+        kernel = self.kernel if self.kernels is None else self.kernels[group]
+        return kernel, hyperparameters if hyperparameters.ndim == 1 else hyperparameters[group]
 
     def group_of(self, output: int) -> int:
         """Index of the group of an output."""
@@ -90,10 +90,10 @@ class SparseModel:
     ) -> list[SufficientStatistics]:
         """The same statistics, with the charge of Titsias (2009) in the tight bound, which is not below its own."""
         pairs = zip(self.groups, statistics, strict=True)
-        ratios = ((self._ratio(values, outputs), own) for outputs, own in pairs)
+        ratios = ((self._ratio(values, outputs), sums) for outputs, sums in pairs)
         return [
-            own if ratio is None else replace(own, charge=np.outer([1, 1], ratio * own.unexplained))
-            for ratio, own in ratios
+            sums if ratio is None else replace(sums, charge=np.outer([1, 1], ratio * sums.unexplained))
+            for ratio, sums in ratios
         ]
 
     def _ratio(self, values: Values, outputs: slice) -> np.ndarray | None:
@@ -106,7 +106,16 @@ class SparseModel:
         if self.complete:
             statistics = replace(statistics, unexplained=0.0, charge=0.0)
         prior = self.prior.at(values).outputs(outputs)
-        return Group(outputs, whitening, statistics, signal, noise, prior, self.complete, self.variant.of_fit)
+        return Group(
+            outputs=outputs,
+            whitening=whitening,
+            statistics=statistics,
+            signal=signal,
+            noise=noise,
+            prior=prior,
+            complete=self.complete,
+            variant=self.variant.of_fit,
+        )
 
     def groups_of(
         self,
@@ -116,7 +125,7 @@ class SparseModel:
     ) -> list[Group]:
         """All groups, with statistics for the same hyperparameters and inducing points."""
         sets = zip(self.groups, whitenings or self.whitenings(values), statistics, strict=True)
-        return [self.group(values, *own) for own in sets]
+        return [self.group(values, outputs, whitening, sums) for outputs, whitening, sums in sets]
 
     def groups_on(self, values: Values, blocks: Blocks, share: float = 1.0) -> Iterator[Group]:
         """Each group, with the statistics of some rows. The pass over the rows is made when the group is asked for.
@@ -180,22 +189,24 @@ class SparseModel:
 
         ``leaks`` (p, m) are given if f is orthogonal to the features.
         """
-        groups = [
-            PredictorGroup.of(
-                outputs,
-                *self.kernel_of(values, index),
-                points,
-                whitening,
-                values["signal"][outputs],
-                self.prior.at(values).outputs(outputs),
-                mean[outputs],
-                root[outputs],
-                None if leaks is None else leaks[outputs],
+        groups = []
+        sets = zip(self.groups, values["inducing_points"], whitenings, strict=True)
+        for index, (outputs, points, whitening) in enumerate(sets):
+            kernel, hyperparameters = self.kernel_of(values, index)
+            groups.append(
+                PredictorGroup.of(
+                    outputs=outputs,
+                    kernel=kernel,
+                    hyperparameters=hyperparameters,
+                    points=points,
+                    whitening=whitening,
+                    signal=values["signal"][outputs],
+                    prior=self.prior.at(values).outputs(outputs),
+                    mean=mean[outputs],
+                    root=root[outputs],
+                    leaks=None if leaks is None else leaks[outputs],
+                )
             )
-            for index, (outputs, points, whitening) in enumerate(
-                zip(self.groups, values["inducing_points"], whitenings, strict=True)
-            )
-        ]
         noise = values["noise"]
         return Predictor(tuple(groups), noise, self.prior.offset, np.zeros(len(noise)), self.prior.shared)
 
@@ -206,9 +217,10 @@ def _refined(group: Group, posteriors: list[WhitenedPosterior], blocks: Blocks) 
     # solution of B mean = g loses digits. ρ = g - B mean, from residuals summed row by row, does not. If errors of B
     # are above `_REFINABLE`, a step need not lead closer.
     weights = np.column_stack([group.times_T(o, q.mean) for o, q in enumerate(posteriors)])
-    residuals, found = errors(blocks, group.whitening, group.outputs, weights), []
+    residuals = errors(blocks, group.whitening, group.outputs, weights)
+    refined = []
     for q, error in zip(posteriors, equation_errors(group, posteriors, residuals), strict=True):
         step = q.root_inv.T @ (q.root_inv @ error)
         refinable = np.finfo(float).eps * np.trace(q.B) < _REFINABLE
-        found.append(replace(q, mean=q.mean + step) if refinable else q)
-    return found
+        refined.append(replace(q, mean=q.mean + step) if refinable else q)
+    return refined

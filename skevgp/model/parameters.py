@@ -80,10 +80,10 @@ class ParameterTable:
         self._slices: dict[str, slice] = {}
         self._starts: dict[str, np.ndarray] = {}
         self.size = 0
-        for own in self.parameters:
-            end = self.size + int(own.free.sum())
-            self._slices[own.name], self.size = slice(self.size, end), end
-            self._starts[own.name] = own.coordinate(own.start)
+        for parameter in self.parameters:
+            end = self.size + int(parameter.free.sum())
+            self._slices[parameter.name], self.size = slice(self.size, end), end
+            self._starts[parameter.name] = parameter.coordinate(parameter.start)
 
     def __getitem__(self, name: str) -> Parameter:
         return next(parameter for parameter in self.parameters if parameter.name == name)
@@ -92,11 +92,13 @@ class ParameterTable:
 
     def changed(self, name: str, **fields: Any) -> ParameterTable:
         """The same table with other fields of one parameter, such as its start, perhaps of another shape."""
-        return ParameterTable([replace(own, **fields) if own.name == name else own for own in self.parameters])
+        return ParameterTable(
+            [replace(parameter, **fields) if parameter.name == name else parameter for parameter in self.parameters]
+        )
 
     def without(self, name: str) -> ParameterTable:
         """The same table without one parameter."""
-        return ParameterTable([own for own in self.parameters if own.name != name])
+        return ParameterTable([parameter for parameter in self.parameters if parameter.name != name])
 
     def started_at(self, values: Values) -> ParameterTable:
         """The same table with the free entries at other starts, for each parameter whose shape agrees.
@@ -104,20 +106,24 @@ class ParameterTable:
         Where these starts are at an upper limit or above, the widest limit replaces it.
         """
         parameters = []
-        for own in self.widened(self.held(values)).parameters:
-            if own.name in values and values[own.name].shape == own.start.shape:
-                own = replace(own, start=np.where(own.fixed, own.start, values[own.name]))
-            parameters.append(own)
+        for parameter in self.widened(self.held(values)).parameters:
+            if parameter.name in values and values[parameter.name].shape == parameter.start.shape:
+                parameter = replace(parameter, start=np.where(parameter.fixed, parameter.start, values[parameter.name]))
+            parameters.append(parameter)
         return ParameterTable(parameters)
 
     def held(self, values: Values) -> tuple[str, ...]:
         """Names of parameters with free values at or above an upper limit that is not the widest."""
         names = []
-        for own in self.parameters:
-            if own.widest is not None and own.name in values and values[own.name].shape == own.start.shape:
-                at_limit = values[own.name] >= (1.0 - _AT_LIMIT) * own.upper
-                if (at_limit.ravel() & own.free).any():
-                    names.append(own.name)
+        for parameter in self.parameters:
+            if (
+                parameter.widest is not None
+                and parameter.name in values
+                and values[parameter.name].shape == parameter.start.shape
+            ):
+                at_limit = values[parameter.name] >= (1.0 - _AT_LIMIT) * parameter.upper
+                if (at_limit.ravel() & parameter.free).any():
+                    names.append(parameter.name)
         return tuple(names)
 
     def widened(self, names: Iterable[str]) -> ParameterTable:
@@ -140,45 +146,53 @@ class ParameterTable:
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limits (size,) of the flat vector."""
-        lower = self.flat({own.name: own.coordinate(own.lower) for own in self.parameters})
-        return lower, self.flat({own.name: own.coordinate(own.upper) for own in self.parameters})
+        lower = self.flat({parameter.name: parameter.coordinate(parameter.lower) for parameter in self.parameters})
+        upper = self.flat({parameter.name: parameter.coordinate(parameter.upper) for parameter in self.parameters})
+        return lower, upper
 
     def alike(self) -> np.ndarray:
         """An integer (size,) for each coordinate. Coordinates of one column of a parameter of three axes share it."""
         kinds, n_kinds = {}, 0
-        for own in self.parameters:
-            shape = own.start.shape
-            n_own = shape[2] if len(shape) == 3 else own.start.size
-            kinds[own.name] = n_kinds + np.arange(own.start.size) % max(n_own, 1)
+        for parameter in self.parameters:
+            shape = parameter.start.shape
+            n_own = shape[2] if len(shape) == 3 else parameter.start.size
+            kinds[parameter.name] = n_kinds + np.arange(parameter.start.size) % max(n_own, 1)
             n_kinds += n_own
         return self.flat(kinds).astype(int)
 
     def coordinates(self, flat: Any) -> dict[str, Any]:
         """The coordinates by name, each in its parameter's shape. Autograd can trace this."""
-        found = {}
-        for own in self.parameters:
-            part = flat[self._slices[own.name]]
-            if not own.free.any():
-                part = self._starts[own.name]
-            elif not own.free.all():
+        coordinates = {}
+        for parameter in self.parameters:
+            part = flat[self._slices[parameter.name]]
+            if not parameter.free.any():
+                part = self._starts[parameter.name]
+            elif not parameter.free.all():
                 # The k-th free entry is part[k].
-                part = anp.where(own.free, part[np.cumsum(own.free) - 1], self._starts[own.name])
-            found[own.name] = part.reshape(own.start.shape)
-        return found
+                part = anp.where(parameter.free, part[np.cumsum(parameter.free) - 1], self._starts[parameter.name])
+            coordinates[parameter.name] = part.reshape(parameter.start.shape)
+        return coordinates
 
     def values(self, flat: np.ndarray) -> Values:
         """The values by name, in the parameters' own units."""
         values = self.coordinates(flat)
-        for own in self.parameters:
-            at = values[own.name]
-            values[own.name] = np.exp(at) if own.transform == "log" else own.origin + at * own.unit
+        for parameter in self.parameters:
+            at = values[parameter.name]
+            values[parameter.name] = (
+                np.exp(at) if parameter.transform == "log" else parameter.origin + at * parameter.unit
+            )
         return values
 
     def gradient(self, bars: Values) -> np.ndarray:
         """The gradient (size,) in the flat vector, from gradients in values or, for "log", in their logarithms."""
-        units = {own.name: own.unit if own.transform == "identity" else 1.0 for own in self.parameters}
+        units = {
+            parameter.name: parameter.unit if parameter.transform == "identity" else 1.0
+            for parameter in self.parameters
+        }
         return self.flat({name: bars[name] * unit for name, unit in units.items()})
 
     def flat(self, parts: Values) -> np.ndarray:
         """The flat vector (size,) of coordinates by name, or of gradients in them."""
-        return np.concatenate([np.empty(0), *(np.ravel(parts[own.name])[own.free] for own in self.parameters)])
+        return np.concatenate(
+            [np.empty(0), *(np.ravel(parts[parameter.name])[parameter.free] for parameter in self.parameters)]
+        )

@@ -53,12 +53,12 @@ class CoefficientPrior:
         root = None if self.root is None else self.root * by[:, :, np.newaxis]
         return replace(self, scale=self.scale * by, reference=self.reference / by, root=root)
 
-    def of_groups(self, each: np.ndarray) -> np.ndarray:
+    def of_groups(self, numbers: np.ndarray) -> np.ndarray:
         """Sums (o, g) over the weights of each group of numbers (o, p). Shared weights have one row, the first."""
         assert self.groups is not None
-        sums = np.zeros((len(each), self.n_groups + 1))
-        for own, numbers, group in zip(sums, each, self.groups, strict=True):
-            np.add.at(own, group, numbers)
+        sums = np.zeros((len(numbers), self.n_groups + 1))
+        for sums_of_output, numbers_of_output, groups_of_output in zip(sums, numbers, self.groups, strict=True):
+            np.add.at(sums_of_output, groups_of_output, numbers_of_output)
         return sums[:1, :-1] if self.shared else sums[:, :-1]
 
     @property
@@ -137,24 +137,34 @@ class PredictorGroup:
         """
         m, s = len(points), np.sqrt(signal)[:, np.newaxis]
         # mean Tᵀ and root Tᵀ, with T = blockdiag(s I, C) of each output (see `bounds.Group.times_T`).
-        own_mean, own_root, leak = np.array(mean), np.array(root), None
+        means, roots, leak = np.array(mean), np.array(root), None
         if leaks is not None:
             # w = w⊥ - leak v, and in the predictor's coordinates β⊥ = β + (C leak / s) (s v).
-            each = np.array(leaks)
-            own_mean[:, m:] -= np.einsum("opm,om->op", each, own_mean[:, :m])
-            own_root[:, :, m:] -= np.einsum("okm,opm->okp", own_root[:, :, :m], each)
-            leak = prior.roots() @ each / s[:, np.newaxis]
-        own_mean[:, :m] *= s
-        own_mean[:, m:] = prior.times(own_mean[:, m:])
-        own_root[:, :, :m] *= s[:, np.newaxis]
-        own_root[:, :, m:] = own_root[:, :, m:] @ prior.roots().transpose(0, 2, 1)
-        return cls(outputs, kernel, hyperparameters, points, whitening, signal, own_mean, own_root, leak)
+            leaks_of_outputs = np.array(leaks)
+            means[:, m:] -= np.einsum("opm,om->op", leaks_of_outputs, means[:, :m])
+            roots[:, :, m:] -= np.einsum("okm,opm->okp", roots[:, :, :m], leaks_of_outputs)
+            leak = prior.roots() @ leaks_of_outputs / s[:, np.newaxis]
+        means[:, :m] *= s
+        means[:, m:] = prior.times(means[:, m:])
+        roots[:, :, :m] *= s[:, np.newaxis]
+        roots[:, :, m:] = roots[:, :, m:] @ prior.roots().transpose(0, 2, 1)
+        return cls(
+            outputs=outputs,
+            kernel=kernel,
+            hyperparameters=hyperparameters,
+            points=points,
+            whitening=whitening,
+            signal=signal,
+            mean=means,
+            root=roots,
+            leak=leak,
+        )
 
     def weight_roots(self) -> np.ndarray:
         """Roots (o, k, p) of the covariance of the weights. They are those of the best fit if f is orthogonal."""
         m = len(self.points)
-        found = self.root[:, :, m:]
-        return found if self.leak is None else found + np.einsum("okm,opm->okp", self.root[:, :, :m], self.leak)
+        roots = self.root[:, :, m:]
+        return roots if self.leak is None else roots + np.einsum("okm,opm->okp", self.root[:, :, :m], self.leak)
 
 
 class Projected(NamedTuple):
@@ -204,8 +214,8 @@ class Predictor:
         groups = []
         for group in self.groups:
             roots, of_weights = [], group.weight_roots()[:, :, -d:]
-            for root, weights, own in zip(group.root, of_weights, K[group.outputs], strict=True):
-                Q, R = np.linalg.qr(weights @ np.linalg.pinv(own).T, mode="complete")
+            for root, weights, K_of_output in zip(group.root, of_weights, K[group.outputs], strict=True):
+                Q, R = np.linalg.qr(weights @ np.linalg.pinv(K_of_output).T, mode="complete")
                 signs = np.where(np.diagonal(R) < 0.0, -1.0, 1.0)
                 roots.append(np.concatenate([Q[:, q:], Q[:, :q] * signs], axis=1).T @ root)
             groups.append(replace(group, root=np.array(roots)))
@@ -228,10 +238,11 @@ class Predictor:
         for part, columns in zip(parts, outputs, strict=True):
             noise[columns] = part.noise * unit[columns] ** 2
             for group in part.groups:
-                own = np.array(columns)[group.outputs].tolist()
-                by = unit[own][:, np.newaxis]
-                signal, mean, root = group.signal * unit[own] ** 2, group.mean * by, group.root * by[:, np.newaxis]
-                groups.append(replace(group, outputs=own, signal=signal, mean=mean, root=root))
+                columns_of_group = np.array(columns)[group.outputs].tolist()
+                by = unit[columns_of_group][:, np.newaxis]
+                signal = group.signal * unit[columns_of_group] ** 2
+                mean, root = group.mean * by, group.root * by[:, np.newaxis]
+                groups.append(replace(group, outputs=columns_of_group, signal=signal, mean=mean, root=root))
         return cls(tuple(groups), noise, offset, intercept, parts[0].shared)
 
     @property
@@ -248,8 +259,8 @@ class Predictor:
     @property
     def by_output(self) -> list[PredictorGroup]:
         """The group of each output."""
-        found = {o: group for group in self.groups for o in np.arange(len(self.noise))[group.outputs]}
-        return [found[o] for o in range(len(self.noise))]
+        groups = {o: group for group in self.groups for o in np.arange(len(self.noise))[group.outputs]}
+        return [groups[o] for o in range(len(self.noise))]
 
     def predict(
         self, inputs: np.ndarray, features: np.ndarray, return_variance: bool = False
@@ -259,14 +270,14 @@ class Predictor:
         ``inputs`` of the kernel are (n, d) or (n, o, d). ``features`` h(x) are (n, p) or (n, o, p).
         """
         means, variances = [], []
-        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
-            means.append(group.mean @ own.P)
+        for group, rows in zip(self.groups, self.projected(inputs, features), strict=True):
+            means.append(group.mean @ rows.P)
             if return_variance:
                 o, k, size = group.root.shape
-                deviation = group.root.reshape(o * k, size) @ own.P
+                deviation = group.root.reshape(o * k, size) @ rows.P
                 np.multiply(deviation, deviation, out=deviation)
                 squares = deviation.reshape(o, k, len(features)).sum(axis=1)
-                variances.append(np.outer(group.signal, own.unexplained) + squares)
+                variances.append(np.outer(group.signal, rows.unexplained) + squares)
         mean = self.in_order(means).T
         mean += times_weights(features, self.offset)
         mean += self.intercept
@@ -275,7 +286,7 @@ class Predictor:
     def unexplained(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """The part s² (k̃(x, x) - |v|²) (n, o) of the variance that the inducing points do not explain."""
         pairs = zip(self.groups, self.projected(inputs, features), strict=True)
-        return self.in_order(np.outer(group.signal, own.unexplained) for group, own in pairs).T
+        return self.in_order(np.outer(group.signal, rows.unexplained) for group, rows in pairs).T
 
     def covariance(
         self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float = 0.0
@@ -285,9 +296,9 @@ class Predictor:
         The diagonal is the variance from `predict`. The matrices are positive semi-definite up to rounding. ``noise``
         (o,) is added to the diagonal: with σ² it is the covariance of y.
         """
-        mean, own, sizes, common = self._own_covariances(inputs, features, noise)
+        mean, covariances, sizes, common = self._own_covariances(inputs, features, noise)
         covariance = np.empty((len(mean), *mean.shape))
-        for output, (matrix, size, shared) in enumerate(zip(own, sizes, common, strict=True)):
+        for output, (matrix, size, shared) in enumerate(zip(covariances, sizes, common, strict=True)):
             covariance[:, :, output] = nearest_covariance(matrix, size) + shared.T @ shared
         return mean, covariance
 
@@ -300,14 +311,14 @@ class Predictor:
         rng: np.random.RandomState,
     ) -> np.ndarray:
         """Draws (n, o, n_samples) from the distribution with the moments of `covariance`."""
-        mean, own, sizes, common = self._own_covariances(inputs, features, noise)
+        mean, covariances, sizes, common = self._own_covariances(inputs, features, noise)
         # Outputs that share their weights share one draw of them. Their other parts are independent.
         of_weights = rng.standard_normal((common.shape[1], n_samples))
         samples = [
-            own_mean[:, np.newaxis] + covariance_root(matrix, size) @ rng.standard_normal((len(mean), n_samples))
-            for own_mean, matrix, size in zip(mean.T, own, sizes, strict=True)
+            mean_of_output[:, np.newaxis] + covariance_root(matrix, size) @ rng.standard_normal((len(mean), n_samples))
+            for mean_of_output, matrix, size in zip(mean.T, covariances, sizes, strict=True)
         ]
-        return np.stack([each + shared.T @ of_weights for each, shared in zip(samples, common, strict=True)], axis=1)
+        return np.stack([draws + shared.T @ of_weights for draws, shared in zip(samples, common, strict=True)], axis=1)
 
     def _own_covariances(
         self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float
@@ -319,21 +330,21 @@ class Predictor:
         size, n = self.rows_at_once, len(inputs)
         # In parts as in `predict`, because rounding depends on the number of rows.
         parts = [self.predict(inputs[i : i + size], features[i : i + size], True) for i in range(0, n, size)]
-        mean, variance = (np.concatenate(each) for each in zip(*parts, strict=True))
+        mean, variance = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         projected = list(self.projected(inputs, features))
         common = self._common(projected)
         covariances, sizes = np.empty((len(self.noise), n, n)), np.empty((len(self.noise), n))
         p = common.shape[1]
-        for group, own in zip(self.groups, projected, strict=True):
-            V = own.P[: len(group.points)]
-            K = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix()
+        for group, rows in zip(self.groups, projected, strict=True):
+            V = rows.P[: len(group.points)]
+            K = group.kernel.at(np.log(group.hyperparameters), rows.inputs).matrix()
             prior, unexplained = diagonal_of(K), K - V.T @ V
-            found, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
-            for matrix, own_sizes, signal, root in zip(found, terms, group.signal, group.root, strict=True):
-                deviation = root[: len(root) - p] @ own.P
+            matrices, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
+            for matrix, sizes_of_output, signal, root in zip(matrices, terms, group.signal, group.root, strict=True):
+                deviation = root[: len(root) - p] @ rows.P
                 matrix[...] = signal * unexplained + deviation.T @ deviation
-                own_sizes[...] = signal * prior + np.square(deviation).sum(axis=0)
-            covariances[group.outputs], sizes[group.outputs] = found, terms
+                sizes_of_output[...] = signal * prior + np.square(deviation).sum(axis=0)
+            covariances[group.outputs], sizes[group.outputs] = matrices, terms
         of_weights = np.square(common).sum(axis=1)
         diagonals, sizes = (variance + noise).T - of_weights, sizes + of_weights
         for matrix, diagonal in zip(covariances, diagonals, strict=True):
@@ -343,11 +354,11 @@ class Predictor:
     def novelty(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Var[f(x) | data] / Var[f(x)] (n, o)."""
         parts = []
-        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
-            V = own.P[: len(group.points)]
-            left = np.outer(group.signal, own.unexplained)
+        for group, rows in zip(self.groups, self.projected(inputs, features), strict=True):
+            V = rows.P[: len(group.points)]
+            left = np.outer(group.signal, rows.unexplained)
             left += np.square(group.root[:, :, : len(V)] @ V).sum(axis=1)
-            prior = np.outer(group.signal, group.whitening.covariance.diagonal(own.prepared) * np.ones(len(features)))
+            prior = np.outer(group.signal, group.whitening.covariance.diagonal(rows.prepared) * np.ones(len(features)))
             # A linear kernel has no variance at the origin.
             parts.append(np.minimum(left / np.where(prior > 0.0, prior, np.inf), 1.0))
         return self.in_order(parts).T
@@ -362,7 +373,8 @@ class Predictor:
         # independent.
         p = self.n_common
         return self.in_order(
-            group.root[:, group.root.shape[1] - p :] @ own.P for group, own in zip(self.groups, projected, strict=True)
+            group.root[:, group.root.shape[1] - p :] @ rows.P
+            for group, rows in zip(self.groups, projected, strict=True)
         )
 
     def jointly(self, covariance: np.ndarray, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
@@ -378,15 +390,15 @@ class Predictor:
         """Rows as each group sees them."""
         prepared, kernel = None, None
         for group in self.groups:
-            own = of_outputs(inputs, group.outputs)
+            inputs_of_group = of_outputs(inputs, group.outputs)
             if inputs.ndim == 3 or group.kernel is not kernel:
                 kernel = group.kernel
-                prepared = kernel.prepare(own)
+                prepared = kernel.prepare(inputs_of_group)
             H, m = of_outputs(features, group.outputs), len(group.points)
             P = np.empty((m + H.shape[1], len(H)))
             V = group.whitening.solve(prepared, out=P[:m])
             P[m:] = H.T
-            yield Projected(own, prepared, P, group.whitening.remaining(prepared, V))
+            yield Projected(inputs_of_group, prepared, P, group.whitening.remaining(prepared, V))
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
@@ -394,10 +406,10 @@ class Predictor:
         covariance = np.empty((o, p, p))
         for group in self.groups:
             m = len(group.points)
-            own, deviation = group.mean[:, m:], group.weight_roots()
+            weights, deviation = group.mean[:, m:], group.weight_roots()
             if group.leak is not None:
-                own = own + np.einsum("opm,om->op", group.leak, group.mean[:, :m])
-            mean[group.outputs] += own
+                weights = weights + np.einsum("opm,om->op", group.leak, group.mean[:, :m])
+            mean[group.outputs] += weights
             covariance[group.outputs] = deviation.transpose(0, 2, 1) @ deviation
         return mean, covariance
 
@@ -406,7 +418,7 @@ class Predictor:
         first, *others = parts
         if not others:
             return first
-        found = np.empty((len(self.noise), *first.shape[1:]))
+        ordered = np.empty((len(self.noise), *first.shape[1:]))
         for group, part in zip(self.groups, (first, *others), strict=True):
-            found[group.outputs] = part
-        return found
+            ordered[group.outputs] = part
+        return ordered

@@ -195,7 +195,17 @@ def collect(
     VV, VL, unexplained, charge = blocks.sum(partial(_first_pass, whitening, outputs, ratio))
     p = len(HH)
     return SufficientStatistics(
-        sums.n_rows, VV, VL[:, :p], VL[:, p:], HH, HR, RR, float(unexplained), sums.log_variance, sums.surplus, charge
+        n_rows=sums.n_rows,
+        VV=VV,
+        VH=VL[:, :p],
+        VR=VL[:, p:],
+        HH=HH,
+        HR=HR,
+        RR=RR,
+        unexplained=float(unexplained),
+        log_variance=sums.log_variance,
+        surplus=sums.surplus,
+        charge=charge,
     )
 
 
@@ -221,8 +231,8 @@ def _charge(ratio: np.ndarray, unexplained: np.ndarray, counts: np.ndarray | Non
     counts = None if counts is None else np.maximum(counts, 1.0)
     x = np.multiply.outer(ratio, unexplained if counts is None else unexplained / counts)
     slopes = 1.0 / (1.0 + x)
-    each = np.array([np.log1p(x), x * slopes])
-    charge = each.sum(axis=2) if counts is None else each @ counts
+    terms = np.array([np.log1p(x), x * slopes])
+    charge = terms.sum(axis=2) if counts is None else terms @ counts
     return charge, ratio @ slopes / ratio.sum()
 
 

@@ -45,7 +45,7 @@ class WeightLikelihood:
 
 def weight_likelihoods(group: Group) -> list[WeightLikelihood]:
     """The likelihood of the weights of each output of a group."""
-    statistics, found = group.statistics, []
+    statistics, likelihoods = group.statistics, []
     m = len(statistics.VV)
     for o, (signal, noise) in enumerate(zip(group.signal, group.noise, strict=True)):
         # Products of [H, r], and of V with them.
@@ -60,8 +60,8 @@ def weight_likelihoods(group: Group) -> list[WeightLikelihood]:
         diagonal_of(D)[...] += 1.0
         A = triangular_inverse(jittered_cholesky(D, sizes=of_V)) @ crossed if m else crossed
         total, sizes = (linear - signal / noise * (A.T @ A)) / noise, diagonal_of(statistics.HH) / noise
-        found.append(WeightLikelihood(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), sizes))
-    return found
+        likelihoods.append(WeightLikelihood(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), sizes))
+    return likelihoods
 
 
 def likelihood_of_whitened(H: np.ndarray, r: np.ndarray) -> WeightLikelihood:
@@ -110,12 +110,12 @@ class ThetaStep:
         deviation = self.deviation()
         total = self.gradient.sum(axis=0) - self.z
         common = float(np.log(deviation.widths).sum()) + 0.5 * float(total @ deviation.covariance_times(total))
-        found = 0.5 * float(self.z @ self.z) - common
+        nats = 0.5 * float(self.z @ self.z) - common
         for output in range(len(self.gradient)):
             mean, others = self.cavity(output)
-            found += common - float(np.log(others.widths).sum())
-            found -= 0.5 * float(np.square(others.W.T @ mean / others.widths).sum())
-        return found
+            nats += common - float(np.log(others.widths).sum())
+            nats -= 0.5 * float(np.square(others.W.T @ mean / others.widths).sum())
+        return nats
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ class Deviation:
 
     def covariance_times(self, gradient: np.ndarray) -> np.ndarray:
         """The covariance times a vector (q,)."""
-        found: np.ndarray = self.W @ (self.widths**2 * (self.W.T @ gradient))
-        return found
+        product: np.ndarray = self.W @ (self.widths**2 * (self.W.T @ gradient))
+        return product
 
     @property
     def root(self) -> np.ndarray:
@@ -200,11 +200,11 @@ def theta_step(
     for outputs in every:
         S, sizes, g = np.eye(p), np.ones(p), -prior.reference[outputs[0]]
         for output in outputs:
-            C, own = roots[output], likelihoods[output]
-            S = S + C.T @ own.M[:p, :p] @ C
-            sizes += np.square(C).T @ own.sizes[:p]
-            g = g + C.T @ own.h[:p]
-            value -= 0.5 * own.q
+            C, likelihood = roots[output], likelihoods[output]
+            S = S + C.T @ likelihood.M[:p, :p] @ C
+            sizes += np.square(C).T @ likelihood.sizes[:p]
+            g = g + C.T @ likelihood.h[:p]
+            value -= 0.5 * likelihood.q
         root_inv = triangular_inverse(jittered_cholesky(S, sizes=sizes))
         half = root_inv @ g
         value += 0.5 * float(half @ half) + float(np.log(diagonal_of(root_inv)).sum())
@@ -213,18 +213,18 @@ def theta_step(
         first, MDH, MDD = outputs[0], np.zeros((p, q)), np.zeros((q, q))
         slope, largest = np.zeros(q), np.zeros(q)
         for output in outputs:
-            C, own = roots[output], likelihoods[output]
+            C, likelihood = roots[output], likelihoods[output]
             change = C @ w
             beta[output], reference[output] = offset[output] + change, prior.reference[output] + w
             CR, by = C @ root_inv.T, beta[output, feature]
             K[output, range(d), parameter] = by
-            u = own.h[p:] - own.M[p:, :p] @ change
-            spread = np.einsum("dk,dk->d", own.M[p:, :p] @ CR, CR[feature])
+            u = likelihood.h[p:] - likelihood.M[p:, :p] @ change
+            spread = np.einsum("dk,dk->d", likelihood.M[p:, :p] @ CR, CR[feature])
             slope += np.bincount(parameter, u * by, minlength=q)
             gradient[first] -= np.bincount(parameter, spread, minlength=q)
-            MDD += K[output].T @ own.M[p:, p:] @ K[output]
-            largest += np.square(K[output]).T @ own.sizes[p:]
-            MDH += root_inv @ (C.T @ own.M[:p, p:] @ K[output])
+            MDD += K[output].T @ likelihood.M[p:, p:] @ K[output]
+            largest += np.square(K[output]).T @ likelihood.sizes[p:]
+            MDH += root_inv @ (C.T @ likelihood.M[:p, p:] @ K[output])
         root[first], projector = information_root(MDD - MDH.T @ MDH, largest)
         gradient[first] += projector @ slope
     return ThetaStep(value, gradient, root, z, beta, reference, K)
