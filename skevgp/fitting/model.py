@@ -110,7 +110,7 @@ def models_of(
     for output, kernel in enumerate(kernels):
         inputs = sample.of([output]).inputs
         alone = starting_table(problem, rows.outputs([output]), np.empty((1, 0, inputs.shape[1]))).values_at_start()
-        points.append(placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng))
+        points.append(placement.points(inputs, kernel, alone["hyperparameters"], rng))
     first = problem.spec.starts.hyperparameters.value
     variance = 1.0 if first is None else checked_variance(kernels[0], first, points[0])
 
@@ -282,7 +282,7 @@ class Model:
         """The bound of the features with as little Gaussian process as the limits allow."""
         values, signal, rows = self.table.values_at_start(), self.table["signal"], self.rows
         points, (kernel, hyperparameters) = values["inducing_points"][0], self.sparse.kernel_of(values, 0)
-        variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
+        variance = np.mean(kernel.at(hyperparameters, points).diagonal(kernel.prepare(points)))
         little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
         trace = little * variance * rows.total * rows.mean_precision
         hidden = may_hide_noise(self.sparse.prior, self.blocks.linear.length)
@@ -340,7 +340,7 @@ class Model:
         for group, outputs in enumerate(self.sparse.groups if self.sparse.kernels is not None else (slice(None),)):
             kernel, hyperparameters = self.sparse.kernel_of(values, group)
             inputs = of_outputs(sample.inputs, outputs)
-            sets.append(placement.points(inputs, kernel, np.log(hyperparameters), self.rng))
+            sets.append(placement.points(inputs, kernel, hyperparameters, self.rng))
         m = min(map(len, sets))
         points = np.array([own[:m] for own in sets])
         return values | {"inducing_points": np.repeat(points, len(self.sparse.groups) // len(points), axis=0)}
@@ -365,7 +365,7 @@ class Model:
                 sets.append(distinct)
             else:
                 everything = False
-                sets.append(with_more(points, wanted, inputs, kernel, np.log(hyperparameters)))
+                sets.append(with_more(points, wanted, inputs, kernel, hyperparameters))
         n_inducing = min(map(len, sets))
         if n_inducing <= self.n_inducing:
             return None

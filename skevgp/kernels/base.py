@@ -20,6 +20,9 @@ from ..utils.casadi import casadi
 
 # Inputs and inducing points are in the user's coordinates. A covariance of differences subtracts a centre from both, so
 # that large coordinates cost no digits. Gradients follow the sum and product rules; each family has its own by hand.
+#
+# ``hyperparameters`` are values here as in the whole library, such as the length scale itself. All functions take
+# values. Only gradients are in the logarithms, because a fit searches there: ∂/∂ log h = h ∂/∂h.
 
 # A derivative of k(x, x) for each row: an array (n,), or one number for all rows.
 PerRow = np.ndarray | float
@@ -163,11 +166,11 @@ class CovarianceAt(ABC):
 
     @abstractmethod
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradients in hyperparameters and inducing points; ``K_bar``, that in `matrix`, is symmetric."""
+        """Return gradients in log hyperparameters and in inducing points; ``K_bar``, that in `matrix`, is symmetric."""
 
 
 class Covariance(ABC):
-    """A covariance k̃ with positive hyperparameters, which all methods take as logarithms.
+    """A covariance k̃ with positive hyperparameters. All methods take their values; gradients are in their logarithms.
 
     Two are equal if they are the same function of hyperparameters and inputs, with any centre.
     """
@@ -197,11 +200,11 @@ class Covariance(ABC):
 
     @abstractmethod
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """Return k(x, x') of pairs of rows, (..., d) and (..., d): (...), at log hyperparameters (n_hyper,)."""
+        """Return k(x, x') of pairs of rows, (..., d) and (..., d): (...), at hyperparameters (n_hyper,)."""
 
     @abstractmethod
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
-        """Return the covariance at log hyperparameters (n_hyper,) and inducing points (m, d)."""
+        """Return the covariance at hyperparameters (n_hyper,) and inducing points (m, d)."""
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState

@@ -56,7 +56,7 @@ Derivatives = tuple[np.ndarray, list[np.ndarray]]
 
 
 class Profile(ABC):
-    """φ(E); the logarithms of its own parameters come before the length scales in the vector of hyperparameters."""
+    """φ(E); its own parameters come before the length scales in the vector of hyperparameters."""
 
     n_parameters: ClassVar[int] = 0
 
@@ -76,7 +76,7 @@ class Profile(ABC):
 
     @abstractmethod
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        """Return φ'(E) and the derivative in each log parameter, given φ(E)."""
+        """Return φ'(E) and the derivative in the logarithm of each parameter, given φ(E)."""
 
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
@@ -278,20 +278,20 @@ class Matern(Profile):
 
 @dataclass(frozen=True)
 class RationalQuadratic(Profile):
-    """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter log α."""
+    """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter α."""
 
     n_parameters = 1
     smooth = True
     has_root = False
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        alpha = np.exp(parameters[0])
+        alpha = parameters[0]
         log = np.log1p(self._ratio(E, alpha))
         log *= -alpha
         return np.exp(log, out=log)
 
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        alpha = np.exp(parameters[0])
+        alpha = parameters[0]
         ratio = self._ratio(E, alpha)
         from_alpha = ratio / (1.0 + ratio)
         from_alpha -= np.log1p(ratio)
@@ -311,14 +311,14 @@ class RationalQuadratic(Profile):
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
         # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): normals whose variance has a gamma distribution.
-        (size, d), alpha, normals = shape, float(np.exp(parameters[0])), rng.standard_normal(shape)
+        (size, d), alpha, normals = shape, float(parameters[0]), rng.standard_normal(shape)
         drawn = normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis]
         if alpha > _LARGE_ALPHA:
             return drawn, np.ones(size)
         return widened(drawn, _variance_gamma(alpha, d), _MUCH_WIDER)
 
     def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        ca, alpha = casadi(), float(np.exp(parameters[0]))
+        ca, alpha = casadi(), float(parameters[0])
         return ca.exp(-alpha * ca.log1p(squared / (2.0 * alpha)))
 
 
@@ -345,7 +345,7 @@ def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
 
 @dataclass(frozen=True)
 class Stationary(Covariance):
-    """k̃(x, x') = φ(-½ Σ_d ((x_d - x'_d) / ℓ_d)²); hyperparameters: those of φ, then log ℓ."""
+    """k̃(x, x') = φ(-½ Σ_d ((x_d - x'_d) / ℓ_d)²); hyperparameters: those of φ, then ℓ."""
 
     profile: Profile  # φ
     n_columns: int
@@ -365,45 +365,49 @@ class Stationary(Covariance):
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
-        scaled = (inputs - others) * np.exp(-lengths)
-        return self.profile.value(-0.5 * np.einsum("...d,...d->...", scaled, scaled), own)
+        parameters, lengthscales = self._split(hyperparameters)
+        scaled = (inputs - others) / lengthscales
+        return self.profile.value(-0.5 * np.einsum("...d,...d->...", scaled, scaled), parameters)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
-        return StationaryAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
+        points = self.rows.centred(inducing_points)
+        return StationaryAt(self.profile, *self._split(hyperparameters), points, self.isotropic)
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Waves]]:
-        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
-        frequencies, weights = self.profile.spectrum(own, shape, rng)
-        return [(Waves.drawn(frequencies * np.exp(-lengths), weights, self.rows, rng),)]
+        parameters, lengthscales = self._split(hyperparameters)
+        frequencies, weights = self.profile.spectrum(parameters, shape, rng)
+        return [(Waves.drawn(frequencies / lengthscales, weights, self.rows, rng),)]
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, float]:
         ca, x = casadi(), self.rows.symbol(x)
-        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
-        lengths = np.full(self.n_columns, np.exp(lengths))
-        scaled = self.rows.centred(points) / lengths
+        parameters, lengthscales = self._split(hyperparameters)
+        scaled = self.rows.centred(points) / lengthscales
         if self.profile.has_root:
             # Differences keep all digits if r² is small.
-            squared = ca.sum2((ca.DM(scaled) - ca.repmat((x / ca.DM(lengths)).T, len(scaled), 1)) ** 2)
+            squared = ca.sum2((ca.DM(scaled) - ca.repmat((x / ca.DM(lengthscales)).T, len(scaled), 1)) ** 2)
         else:
             # One product that is linear in [x, x²], as in predictions, has small derivatives.
-            factor = np.hstack([-2.0 * scaled / lengths, np.broadcast_to(lengths**-2.0, scaled.shape)])
+            factor = np.hstack([-2.0 * scaled / lengthscales, np.broadcast_to(lengthscales**-2.0, scaled.shape)])
             squared = ca.mtimes(ca.DM(factor), ca.vertcat(x, x**2)) + ca.DM((scaled**2).sum(axis=1))
-        return self.profile.expression(squared, own), 1.0
+        return self.profile.expression(squared, parameters), 1.0
+
+    def _split(self, hyperparameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parameters of φ, and the length scale of each column (d,)."""
+        parameters, lengthscales = np.split(hyperparameters, [self.profile.n_parameters])
+        return parameters, np.full(self.n_columns, lengthscales)
 
 
 class StationaryAt(CovarianceAt):
-    """A `Stationary` at given hyperparameters and centred inducing points (m, d)."""
+    """A `Stationary` at given parameters of φ, length scales (d,) and centred inducing points (m, d)."""
 
-    def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
-        lengthscales = np.exp(hyperparameters[profile.n_parameters :])
-        self.profile, self.parameters = profile, hyperparameters[: profile.n_parameters]
-        self.isotropic = len(lengthscales) < points.shape[1]
-        d, self.points = points.shape[1], points
-        self.lengthscales = np.full(d, lengthscales)
-        precision = self.lengthscales**-2.0
+    def __init__(
+        self, profile: Profile, parameters: np.ndarray, lengthscales: np.ndarray, points: np.ndarray, isotropic: bool
+    ):
+        self.profile, self.parameters, self.lengthscales = profile, parameters, lengthscales
+        self.points, self.isotropic = points, isotropic
+        d, precision = points.shape[1], lengthscales**-2.0
         self._exponent = np.empty((len(points), 2 * d + 1))
         self._exponent[:, :d] = points * precision
         self._exponent[:, d] = -0.5 * (points**2 @ precision)
@@ -482,12 +486,13 @@ class StationaryAt(CovarianceAt):
 
 @dataclass(frozen=True)
 class SquaredExponential(Stationary):
-    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9)."""
+    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters ℓ (Rasmussen & Williams 2006, eq. 4.9)."""
 
     profile: Profile = field(default=Exponential(), init=False)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
-        return SquaredExponentialAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
+        points = self.rows.centred(inducing_points)
+        return SquaredExponentialAt(self.profile, *self._split(hyperparameters), points, self.isotropic)
 
 
 class SquaredExponentialAt(StationaryAt):

@@ -326,7 +326,7 @@ class Predictor:
         p = common.shape[1]
         for group, own in zip(self.groups, projected, strict=True):
             V = own.P[: len(group.points)]
-            K = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix()
+            K = group.kernel.at(group.hyperparameters, own.inputs).matrix()
             prior, unexplained = diagonal_of(K), K - V.T @ V
             found, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
             for matrix, own_sizes, signal, root in zip(found, terms, group.signal, group.root, strict=True):
