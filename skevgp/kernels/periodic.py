@@ -22,7 +22,6 @@ class ExpSineSquared(Profile):
     """φ = exp(-2 sin²(π r) / ℓ²), r = |x - x'| / period (Rasmussen & Williams 2006, eq. 4.31). Parameter ℓ."""
 
     n_parameters = 1
-    smooth = True
     has_root = True
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:

@@ -58,17 +58,15 @@ Derivatives = tuple[np.ndarray, list[np.ndarray]]
 class Profile(ABC):
     """φ(E); its own parameters come before the length scales in the vector of hyperparameters."""
 
+    # A subclass sets only what differs from these.
     n_parameters: ClassVar[int] = 0
+    # Whether φ takes the root of r², which then needs all its digits.
+    has_root: ClassVar[bool] = False
 
     @property
     def smooth(self) -> bool:
         """Whether φ'(E) is finite at E = 0."""
         return True
-
-    @property
-    def has_root(self) -> bool:
-        """Whether φ takes the root of r², which then needs all its digits."""
-        return False
 
     @abstractmethod
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -93,10 +91,6 @@ class Profile(ABC):
 class Exponential(Profile):
     """φ = exp(E): the squared exponential (Rasmussen & Williams 2006, eq. 4.9)."""
 
-    n_parameters = 0
-    smooth = True
-    has_root = False
-
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         return np.exp(E)
 
@@ -113,110 +107,10 @@ class Exponential(Profile):
 
 
 @dataclass(frozen=True)
-class Matern12(Profile):
-    """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
-
-    n_parameters = 0
-    smooth = False
-    has_root = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.exp(-np.sqrt(-2.0 * E))
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
-
-    def spectrum(
-        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return _student_t(0.5, shape, rng)
-
-    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        # A lower limit of r² above 0 keeps derivatives from being NaN.
-        ca = casadi()
-        return ca.exp(-ca.sqrt(ca.fmax(squared, 1e-60)))
-
-
-@dataclass(frozen=True)
-class Matern32(Profile):
-    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
-
-    n_parameters = 0
-    smooth = True
-    has_root = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-6.0 * E)
-        decay = np.exp(-t)
-        t += 1.0
-        t *= decay
-        return t
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-6.0 * E)
-        t += 1.0
-        np.divide(value, t, out=t)
-        t *= 3.0
-        return t, []
-
-    def spectrum(
-        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return _student_t(1.5, shape, rng)
-
-    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        ca = casadi()
-        t = ca.sqrt(3.0 * (squared + TINY))
-        return (1.0 + t) * ca.exp(-t)
-
-
-@dataclass(frozen=True)
-class Matern52(Profile):
-    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
-
-    n_parameters = 0
-    smooth = True
-    has_root = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-10.0 * E)
-        decay = np.exp(-t)
-        decay *= self._polynomial(E, t)
-        return decay
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-10.0 * E)
-        polynomial = self._polynomial(E, t)
-        t += 1.0
-        t *= 5.0 / 3.0
-        t *= value
-        t /= polynomial
-        return t, []
-
-    @staticmethod
-    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
-        polynomial = (-10.0 / 3.0) * E
-        polynomial += t
-        polynomial += 1.0
-        return polynomial
-
-    def spectrum(
-        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return _student_t(2.5, shape, rng)
-
-    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        ca, t2 = casadi(), 5.0 * (squared + TINY)
-        t = ca.sqrt(t2)
-        return (1.0 + t + t2 / 3.0) * ca.exp(-t)
-
-
-@dataclass(frozen=True)
 class Matern(Profile):
     """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r, ν up to `LARGEST_NU` (Rasmussen & Williams 2006, eq. 4.14)."""
 
     nu: float
-    n_parameters = 0
     has_root = True
 
     @property
@@ -277,12 +171,78 @@ class Matern(Profile):
 
 
 @dataclass(frozen=True)
+class Matern12(Matern):
+    """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
+
+    nu: float = field(default=0.5, init=False)
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        return np.exp(-np.sqrt(-2.0 * E))
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        # A lower limit of r² above 0 keeps derivatives from being NaN.
+        ca = casadi()
+        return ca.exp(-ca.sqrt(ca.fmax(squared, 1e-60)))
+
+
+@dataclass(frozen=True)
+class Matern32(Matern):
+    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    nu: float = field(default=1.5, init=False)
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        t = np.sqrt(-6.0 * E)
+        decay = np.exp(-t)
+        t += 1.0
+        t *= decay
+        return t
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-6.0 * E)
+        t += 1.0
+        np.divide(value, t, out=t)
+        t *= 3.0
+        return t, []
+
+
+@dataclass(frozen=True)
+class Matern52(Matern):
+    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    nu: float = field(default=2.5, init=False)
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        t = np.sqrt(-10.0 * E)
+        decay = np.exp(-t)
+        decay *= self._polynomial(E, t)
+        return decay
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-10.0 * E)
+        polynomial = self._polynomial(E, t)
+        t += 1.0
+        t *= 5.0 / 3.0
+        t *= value
+        t /= polynomial
+        return t, []
+
+    @staticmethod
+    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
+        polynomial = (-10.0 / 3.0) * E
+        polynomial += t
+        polynomial += 1.0
+        return polynomial
+
+
+@dataclass(frozen=True)
 class RationalQuadratic(Profile):
     """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter α."""
 
     n_parameters = 1
-    smooth = True
-    has_root = False
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         alpha = parameters[0]
