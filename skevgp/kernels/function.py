@@ -114,9 +114,9 @@ class FunctionKernel(sk.Kernel):
         """
         names = self._defaults()
         super().set_params(**{name: value for name, value in params.items() if name not in names})
-        own = {name: float(params[name]) for name in names if name in params}
-        if own:
-            self.values = {**(self.values or {}), **own}
+        changed = {name: float(params[name]) for name in names if name in params}
+        if changed:
+            self.values = {**(self.values or {}), **changed}
         return self
 
     def __sklearn_clone__(self) -> Self:
@@ -247,11 +247,11 @@ class Function(Covariance):
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
         shape = np.broadcast_shapes(inputs.shape, others.shape)
         inputs, others = (np.broadcast_to(rows, shape).reshape(-1, shape[-1]) for rows in (inputs, others))
-        found = np.empty(len(inputs))
+        covariances = np.empty(len(inputs))
         for first in range(0, len(inputs), _CHUNK):
-            own = slice(first, first + _CHUNK)
-            found[own] = np.diagonal(self.values(hyperparameters, inputs[own], others[own]))
-        return found.reshape(shape[:-1])
+            chunk = slice(first, first + _CHUNK)
+            covariances[chunk] = np.diagonal(self.values(hyperparameters, inputs[chunk], others[chunk]))
+        return covariances.reshape(shape[:-1])
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> FunctionAt:
         return FunctionAt(self, hyperparameters, inducing_points)
@@ -260,8 +260,8 @@ class Function(Covariance):
         """Return k(X, Z), (len(X), len(Z)), at hyperparameters (n_hyper,); ValueError if it has another shape."""
         # The optimiser handles numbers that are not finite.
         with np.errstate(all="ignore"):
-            found = self.function(_own(X), _own(Z), **self._arguments(hyperparameters))
-        return self._checked(self.function, found, (len(X), len(Z)))
+            K = self.function(_copied(X), _copied(Z), **self._arguments(hyperparameters))
+        return self._checked(self.function, K, (len(X), len(Z)))
 
     def diagonal_values(self, hyperparameters: Any, X: Any) -> Any:
         """Return k(x, x) of each row, (len(X),), at hyperparameters (n_hyper,)."""
@@ -269,8 +269,8 @@ class Function(Covariance):
             chunks: Iterator[Any] = (X[first : first + _CHUNK] for first in range(0, len(X), _CHUNK))
             return anp.concatenate([anp.diag(self.values(hyperparameters, chunk, chunk)) for chunk in chunks])
         with np.errstate(all="ignore"):
-            found = self.diagonal(_own(X), **self._arguments(hyperparameters))
-        return self._checked(self.diagonal, found, (len(X),))
+            diagonal = self.diagonal(_copied(X), **self._arguments(hyperparameters))
+        return self._checked(self.diagonal, diagonal, (len(X),))
 
     def pulled_back(self, function: Callable[[Any], Any], argument: Any, bar: np.ndarray) -> Any:
         """Return the gradient in the argument, given that in the value; ValueError if autograd fails."""
@@ -296,10 +296,10 @@ class Function(Covariance):
         return {name: hyperparameters[index] for index, name in enumerate(self.names)}
 
     @staticmethod
-    def _checked(function: Callable[..., Any], found: Any, shape: tuple[int, ...]) -> Any:
-        if np.shape(found) != shape:
-            raise ValueError(f"{name_of(function)} must return an array of shape {shape}; it has {np.shape(found)}.")
-        return found
+    def _checked(function: Callable[..., Any], values: Any, shape: tuple[int, ...]) -> Any:
+        if np.shape(values) != shape:
+            raise ValueError(f"{name_of(function)} must return an array of shape {shape}; it has {np.shape(values)}.")
+        return values
 
 
 class FunctionAt(CovarianceAt):
@@ -344,8 +344,8 @@ class FunctionAt(CovarianceAt):
             return covariance.pulled_back(slope, rows, np.ones(len(rows)))
 
         columns = range(prepared.shape[1])
-        each = [np.stack([of(prepared[i : i + _CHUNK], column) for column in columns], axis=2) for i in chunks]
-        return np.concatenate(each)
+        slopes = [np.stack([of(prepared[i : i + _CHUNK], column) for column in columns], axis=2) for i in chunks]
+        return np.concatenate(slopes)
 
     def start_pullback(self) -> Sums:
         return Sums((np.zeros_like(self.hyperparameters), np.zeros_like(self.inducing_points)))
@@ -373,11 +373,11 @@ class FunctionAt(CovarianceAt):
         return self.hyperparameters * (total[0] + hyper_bar), total[1] + points_bar
 
     @staticmethod
-    def _number(found: Any) -> np.ndarray:
-        return np.asarray(found, dtype=float)
+    def _number(value: Any) -> np.ndarray:
+        return np.asarray(value, dtype=float)
 
 
-def _own(rows: Any) -> Any:
+def _copied(rows: Any) -> Any:
     """Copy rows that may be the user's data, because the user's function may change them."""
     return rows.copy() if isinstance(rows, np.ndarray) else rows
 

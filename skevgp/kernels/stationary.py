@@ -134,10 +134,10 @@ class Matern(Profile):
         with np.errstate(all="ignore"):
             log_bessel = np.log(kve(order, np.minimum(positive, 1e3)))
         factor = (1.0 - self.nu) * np.log(2.0) - gammaln(self.nu)
-        found = np.exp(factor + order * np.log(positive) + log_bessel - positive)
+        values = np.exp(factor + order * np.log(positive) + log_bessel - positive)
         overflow = np.isinf(log_bessel) | (t == 0.0)
-        found[overflow] = at_zero * self._near_zero(t[overflow], order)
-        return found
+        values[overflow] = at_zero * self._near_zero(t[overflow], order)
+        return values
 
     @staticmethod
     def _near_zero(t: np.ndarray, order: float) -> np.ndarray:
@@ -318,8 +318,8 @@ class Stationary(Covariance):
 
     @property
     def lengthscale_mask(self) -> np.ndarray:
-        own = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
-        return own & (not self.isotropic)
+        is_length = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
+        return is_length & (not self.isotropic)
 
     def centred(self, centre: np.ndarray) -> Stationary:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
@@ -397,17 +397,17 @@ class StationaryAt(CovarianceAt):
 
     def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
         slopes, others = self._derivatives(*self._exponents(prepared), U)
-        own = np.array([np.vdot(U_bar, other) for other in others])
+        parameters_bar = np.array([np.vdot(U_bar, other) for other in others])
         np.multiply(U_bar, slopes, out=U_bar)
-        return Sums((U_bar @ prepared.T, own))
+        return Sums((U_bar @ prepared.T, parameters_bar))
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows, own = total
+        rows, parameters_bar = total
         size = -2.0 * float(self._exponent[:, self.points.shape[1]].min())
         slopes, others = self._derivatives(self._exponents_within(), size, self.matrix())
-        own = own + np.array([np.vdot(K_bar, other) for other in others])
+        parameters_bar = parameters_bar + np.array([np.vdot(K_bar, other) for other in others])
         length_bar, Z_bar = self._geometry_bar(rows, K_bar * slopes)
-        return np.concatenate([own, length_bar]), Z_bar
+        return np.concatenate([parameters_bar, length_bar]), Z_bar
 
     def _geometry_bar(self, rows: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return gradients in log ℓ and X_m from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
