@@ -137,7 +137,7 @@ def _expression(own: Map, x: Any, argument: str) -> Mapped:
 def _at(group: PredictorGroup, inputs: Mapped, features: Mapped) -> tuple[Any, Any, Any]:
     """Return k̃(X_m, x), k̃(x, x) and the features of a group."""
     kernel: Any = group.kernel  # the type in `model` has no expressions
-    own = kernel.expression(np.log(group.hyperparameters), group.points, _of(inputs, group.outputs))
+    own = kernel.expression(group.hyperparameters, group.points, _of(inputs, group.outputs))
     return *own, _of(features, group.outputs)
 
 

@@ -208,8 +208,8 @@ class _Waves:
         rng: np.random.RandomState,
     ) -> _Waves:
         """Draw k functions."""
-        hyperparameters, (m, d) = np.log(group.hyperparameters), group.points.shape
-        waves = random_functions(group.kernel, hyperparameters, n_waves, d, rng)
+        m, d = group.points.shape
+        waves = random_functions(group.kernel, group.hyperparameters, n_waves, d, rng)
         at_points = waves.value(group.points)
         weights = drawn_weights(group, k, common, rng).transpose(1, 0, 2)
         by_waves = rng.standard_normal((len(group.signal), k, len(at_points)))
@@ -278,7 +278,7 @@ class _Path:
 
     def __init__(self, group: PredictorGroup, n: int, n_steps: int, common: np.ndarray, rng: np.random.RandomState):
         o = len(group.signal)
-        self.group, self._hyperparameters = group, np.log(group.hyperparameters)
+        self.group = group
         self._weights = drawn_weights(group, n, common, rng)
         self._innovations = rng.standard_normal((n, n_steps, o))
         self._V = np.empty((n, n_steps, len(group.points)))
@@ -291,7 +291,7 @@ class _Path:
         group, t = self.group, self._t
         V = rows.P[: len(group.points)].T
         values = np.einsum("noj,jn->no", self._weights, rows.P)
-        before = group.kernel.paired(self._hyperparameters, self._inputs[:, :t], rows.inputs[:, np.newaxis])
+        before = group.kernel.paired(group.hyperparameters, self._inputs[:, :t], rows.inputs[:, np.newaxis])
         before -= _times(self._V[:, :t], V)
         own = _times(self._L_inv[:, :t, :t], before)  # the row of L
         left = rows.unexplained - np.einsum("nt,nt->n", own, own)

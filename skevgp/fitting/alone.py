@@ -45,7 +45,7 @@ def best_by_sums(
     """The highest bound with q(f) at its prior of a given signal (o,), and the noise variances (o,) for it."""
     values, prior = table.values_at_start(), sparse.prior
     points, (kernel, hyperparameters) = values["inducing_points"][0], sparse.kernel_of(values, 0)
-    variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
+    variance = np.mean(kernel.at(hyperparameters, points).diagonal(kernel.prepare(points)))
     trace = signal * variance * rows.total * rows.mean_precision
     least = highest = noise_left_over(rows, sums, trace)
     if hidden:

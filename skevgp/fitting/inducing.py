@@ -174,7 +174,7 @@ def _least_known(
     n_given = 0 if given is None else len(given)
     rows, chosen = np.empty((n_given + n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
     if given is not None:
-        whitening = Whitening.of(kernel, np.exp(hyperparameters), given)
+        whitening = Whitening.of(kernel, hyperparameters, given)
         whitening.project(prepared, out=rows[:n_given])
         variance = whitening.unexplained(prepared, rows[:n_given])
         for point in (given - moments.mean) / moments.scale:

@@ -166,7 +166,7 @@ def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str
         return ""
     sampled, nearest = neighbours(rows, _PAIRS)
     n = len(sampled.inputs)
-    K = np.abs(kernel.at(np.log(hyperparameters), np.vstack([sampled.inputs, nearest.inputs])).matrix())
+    K = np.abs(kernel.at(hyperparameters, np.vstack([sampled.inputs, nearest.inputs])).matrix())
     variance = np.diagonal(K)
     correlated = np.diagonal(K[:n, n:]) >= _WHITE * np.sqrt(variance[:n]) * np.sqrt(variance[n:])
     if correlated.mean() > _WHITE_SHARE or not alike_neighbours(rows).any():

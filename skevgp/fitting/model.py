@@ -200,7 +200,7 @@ class Model:
         for group, outputs in enumerate(self.sparse.groups if self.sparse.kernels is not None else (slice(None),)):
             kernel, hyperparameters = self.sparse.kernel_of(values, group)
             inputs = of_outputs(sample.inputs, outputs)
-            sets.append(placement.points(inputs, kernel, np.log(hyperparameters), self.rng))
+            sets.append(placement.points(inputs, kernel, hyperparameters, self.rng))
         m = min(map(len, sets))
         points = np.array([own[:m] for own in sets])
         return values | {"inducing_points": np.repeat(points, len(self.sparse.groups) // len(points), axis=0)}
@@ -225,7 +225,7 @@ class Model:
                 sets.append(distinct)
             else:
                 everything = False
-                sets.append(with_more(points, wanted, inputs, kernel, np.log(hyperparameters)))
+                sets.append(with_more(points, wanted, inputs, kernel, hyperparameters))
         n_inducing = min(map(len, sets))
         if n_inducing <= self.n_inducing:
             return None

@@ -133,7 +133,7 @@ class _Common:
             inputs = sample.of([output]).inputs
             table = starting_table(problem, rows.outputs([output]), np.empty((1, 0, inputs.shape[1])))
             hyperparameters = table.values_at_start()["hyperparameters"]
-            points.append(problem.placement.points(inputs, kernel, np.log(hyperparameters), rng))
+            points.append(problem.placement.points(inputs, kernel, hyperparameters, rng))
         given, variance = problem.spec.starts.hyperparameters.value, 1.0
         if given is not None:
             some = np.unique(np.linspace(0, len(points[0]) - 1, _CHECKED_POINTS).astype(int))

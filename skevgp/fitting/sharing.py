@@ -200,7 +200,7 @@ class _ShortFits:
     def shape(self, values: Values) -> np.ndarray:
         """k̃ at the inducing points as a vector of length 1. Products are alignments (Cristianini et al. 2001)."""
         kernel, (points,) = self._each[0].sparse.kernel, values["inducing_points"]
-        K = kernel.at(np.log(values["hyperparameters"]), points).matrix()
+        K = kernel.at(values["hyperparameters"], points).matrix()
         return np.ravel(K) / np.linalg.norm(K)
 
     @cached_property

@@ -31,7 +31,7 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
     Raises a ValueError if k̃(X_m, X_m) is not finite, not symmetric, 0 or not positive semi-definite, if its diagonal
     is not k̃(x, x), or if it has no gradient where x = x'.
     """
-    at = kernel.at(np.log(hyperparameters), inducing_points)
+    at = kernel.at(hyperparameters, inducing_points)
     K = at.matrix()
     if not np.isfinite(K).all():
         raise ValueError("kernel: k(X, X) is not finite at the start of its hyperparameters.")

@@ -20,6 +20,9 @@ from ..utils.casadi import casadi
 
 # Inputs and inducing points are in the user's coordinates. A covariance of differences subtracts a centre from both, so
 # that large coordinates cost no digits. Gradients follow the sum and product rules; each family has its own by hand.
+#
+# ``hyperparameters`` are values here as in the whole library, such as the length scale itself. All functions take
+# values. Only gradients are in the logarithms, because a fit searches there: ∂/∂ log h = h ∂/∂h.
 
 # A derivative of k(x, x) for each row: an array (n,), or one number for all rows.
 PerRow = np.ndarray | float
@@ -108,11 +111,11 @@ class CentredSquares:
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         n, d = inputs.shape
-        found = np.empty((2 * d + 1, n))
-        found[:d] = self.centred(inputs).T
-        found[d] = 1.0
-        np.square(found[:d], out=found[d + 1 :])
-        return found
+        columns = np.empty((2 * d + 1, n))
+        columns[:d] = self.centred(inputs).T
+        columns[d] = 1.0
+        np.square(columns[:d], out=columns[d + 1 :])
+        return columns
 
     def centred(self, points: np.ndarray) -> np.ndarray:
         """Subtract c from points."""
@@ -163,11 +166,11 @@ class CovarianceAt(ABC):
 
     @abstractmethod
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradients in hyperparameters and inducing points; ``K_bar``, that in `matrix`, is symmetric."""
+        """Return gradients in log hyperparameters and in inducing points; ``K_bar``, that in `matrix`, is symmetric."""
 
 
 class Covariance(ABC):
-    """A covariance k̃ with positive hyperparameters, which all methods take as logarithms.
+    """A covariance k̃ with positive hyperparameters. All methods take their values; gradients are in their logarithms.
 
     Two are equal if they are the same function of hyperparameters and inputs, with any centre.
     """
@@ -197,11 +200,11 @@ class Covariance(ABC):
 
     @abstractmethod
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """Return k(x, x') of pairs of rows, (..., d) and (..., d): (...), at log hyperparameters (n_hyper,)."""
+        """Return k(x, x') of pairs of rows, (..., d) and (..., d): (...), at hyperparameters (n_hyper,)."""
 
     @abstractmethod
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
-        """Return the covariance at log hyperparameters (n_hyper,) and inducing points (m, d)."""
+        """Return the covariance at hyperparameters (n_hyper,) and inducing points (m, d)."""
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
@@ -242,18 +245,18 @@ class _Combination(Covariance):
     @property
     def preparations(self) -> tuple[Preparation, ...]:
         """Preparations of all parts, each once."""
-        return tuple(dict.fromkeys(each for part in self.parts for each in _preparations(part)))
+        return tuple(dict.fromkeys(preparation for part in self.parts for preparation in _preparations(part)))
 
     @property
     def rows(self) -> Preparation:
         """The only preparation, or a function that returns a tuple if there are several."""
         only, *others = self.preparations
-        return (lambda inputs: tuple(each(inputs) for each in (only, *others))) if others else only
+        return (lambda inputs: tuple(prepare(inputs) for prepare in (only, *others))) if others else only
 
     def centred(self, centre: np.ndarray) -> _Combination:
         return replace(self, parts=tuple(part.centred(centre) for part in self.parts))
 
-    def own(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
+    def pairs(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
         """Yield each part with its hyperparameters."""
         ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
         return zip(self.parts, np.split(hyperparameters, ends), strict=True)
@@ -262,7 +265,7 @@ class _Combination(Covariance):
         given = self.preparations
         return [
             _Part(part.at(values, inducing_points), _choice(_preparations(part), given))
-            for part, values in self.own(hyperparameters)
+            for part, values in self.pairs(hyperparameters)
         ]
 
 
@@ -271,7 +274,7 @@ class _Part:
     """A part at given parameters, and a function that selects its prepared rows from those of the combination."""
 
     at: CovarianceAt
-    own: Callable[[Any], Any]
+    rows_of: Callable[[Any], Any]
 
 
 def _preparations(covariance: Covariance) -> tuple[Preparation, ...]:
@@ -280,7 +283,7 @@ def _preparations(covariance: Covariance) -> tuple[Preparation, ...]:
 
 def _choice(wanted: tuple[Preparation, ...], given: tuple[Preparation, ...]) -> Callable[[Any], Any]:
     """Return a function that selects the results of the wanted preparations."""
-    return _all_of_it if wanted == given else itemgetter(*(given.index(each) for each in wanted))
+    return _all_of_it if wanted == given else itemgetter(*(given.index(preparation) for preparation in wanted))
 
 
 def _all_of_it(prepared: Any) -> Any:
@@ -291,7 +294,7 @@ class Sum(_Combination):
     """Σ k̃ᵢ(x, x')."""
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return reduce(add, (part.paired(own, inputs, others) for part, own in self.own(hyperparameters)))
+        return reduce(add, (part.paired(values, inputs, others) for part, values in self.pairs(hyperparameters)))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SumAt:
         return SumAt(self._parts_at(hyperparameters, inducing_points))
@@ -299,11 +302,11 @@ class Sum(_Combination):
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Any, ...]]:
-        return [term for part, own in self.own(hyperparameters) for term in part.random_terms(own, shape, rng)]
+        return [term for part, values in self.pairs(hyperparameters) for term in part.random_terms(values, shape, rng)]
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, Any]:
-        parts = [part.expression(own, points, x) for part, own in self.own(hyperparameters)]
-        cross, diagonal = (reduce(add, each) for each in zip(*parts, strict=True))
+        parts = [part.expression(values, points, x) for part, values in self.pairs(hyperparameters)]
+        cross, diagonal = (reduce(add, terms) for terms in zip(*parts, strict=True))
         return cross, diagonal
 
 
@@ -311,7 +314,7 @@ class Product(_Combination):
     """Π k̃ᵢ(x, x')."""
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return reduce(mul, (part.paired(own, inputs, others) for part, own in self.own(hyperparameters)))
+        return reduce(mul, (part.paired(values, inputs, others) for part, values in self.pairs(hyperparameters)))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ProductAt:
         return ProductAt(self._parts_at(hyperparameters, inducing_points))
@@ -319,12 +322,12 @@ class Product(_Combination):
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Any, ...]]:
-        parts = [part.random_terms(own, shape, rng) for part, own in self.own(hyperparameters)]
+        parts = [part.random_terms(values, shape, rng) for part, values in self.pairs(hyperparameters)]
         return [sum(chosen, ()) for chosen in product(*parts)]
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, Any]:
-        parts = [part.expression(own, points, x) for part, own in self.own(hyperparameters)]
-        cross, diagonal = (reduce(mul, each) for each in zip(*parts, strict=True))
+        parts = [part.expression(values, points, x) for part, values in self.pairs(hyperparameters)]
+        cross, diagonal = (reduce(mul, factors) for factors in zip(*parts, strict=True))
         return cross, diagonal
 
 
@@ -339,10 +342,10 @@ class _CombinationAt(CovarianceAt):
         return reduce(self.combine, (part.at.matrix() for part in self.parts))
 
     def cross(self, prepared: Any) -> np.ndarray:
-        return reduce(self.combine, (part.at.cross(part.own(prepared)) for part in self.parts))
+        return reduce(self.combine, (part.at.cross(part.rows_of(prepared)) for part in self.parts))
 
     def diagonal(self, prepared: Any) -> PerRow:
-        return reduce(self.combine, (part.at.diagonal(part.own(prepared)) for part in self.parts))
+        return reduce(self.combine, (part.at.diagonal(part.rows_of(prepared)) for part in self.parts))
 
     def start_pullback(self) -> Sums:
         return Sums(part.at.start_pullback() for part in self.parts)
@@ -352,33 +355,33 @@ class _CombinationAt(CovarianceAt):
 
     def _values(self, prepared: Any) -> list[tuple[np.ndarray, Any]]:
         """Return k(X_m, X) of each part and, if the part is a sum or product, the values of its own parts."""
-        found: list[tuple[np.ndarray, Any]] = []
+        values: list[tuple[np.ndarray, Any]] = []
         for part in self.parts:
-            own = part.own(prepared)
+            rows = part.rows_of(prepared)
             if isinstance(part.at, _CombinationAt):
-                within = part.at._values(own)
-                found.append((reduce(part.at.combine, (value for value, _ in within)), within))
+                within = part.at._values(rows)
+                values.append((reduce(part.at.combine, (value for value, _ in within)), within))
             else:
-                found.append((part.at.cross(own), None))
-        return found
+                values.append((part.at.cross(rows), None))
+        return values
 
     @abstractmethod
     def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
         """Do the same as `cross_pullback`, given the values of the parts."""
 
-    def _each(self, prepared: Any, values: list[Any], U_bars: Iterable[Any], diagonal_bars: Iterable[Any]) -> Sums:
+    def _addends(self, prepared: Any, values: list[Any], U_bars: Iterable[Any], diagonal_bars: Iterable[Any]) -> Sums:
         """Return the addends of all parts."""
-        found = []
+        addends = []
         for part, (U, within), *bars in zip(self.parts, values, U_bars, diagonal_bars, strict=True):
-            own = part.own(prepared)
+            rows = part.rows_of(prepared)
             if isinstance(part.at, _CombinationAt):
-                found.append(part.at._pulled(own, within, *bars))
+                addends.append(part.at._pulled(rows, within, *bars))
             else:
-                found.append(part.at.cross_pullback(own, U, *bars))
-        return Sums(found)
+                addends.append(part.at.cross_pullback(rows, U, *bars))
+        return Sums(addends)
 
     def _finish(self, total: Sums, K_bars: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        gradients = [part.at.finish_pullback(*own) for part, *own in zip(self.parts, total, K_bars, strict=True)]
+        gradients = [part.at.finish_pullback(*bars) for part, *bars in zip(self.parts, total, K_bars, strict=True)]
         return np.concatenate([hyper_bar for hyper_bar, _ in gradients]), reduce(add, (Z_bar for _, Z_bar in gradients))
 
 
@@ -388,18 +391,18 @@ class SumAt(_CombinationAt):
     combine = staticmethod(add)
 
     def slopes(self, prepared: Any) -> np.ndarray:
-        return reduce(add, (part.at.slopes(part.own(prepared)) for part in self.parts))
+        return reduce(add, (part.at.slopes(part.rows_of(prepared)) for part in self.parts))
 
     def diagonal_slopes(self, prepared: Any) -> np.ndarray | float:
-        return reduce(add, (part.at.diagonal_slopes(part.own(prepared)) for part in self.parts))
+        return reduce(add, (part.at.diagonal_slopes(part.rows_of(prepared)) for part in self.parts))
 
     def mixed_slopes(self, prepared: Any) -> np.ndarray:
-        return reduce(add, (part.at.mixed_slopes(part.own(prepared)) for part in self.parts))
+        return reduce(add, (part.at.mixed_slopes(part.rows_of(prepared)) for part in self.parts))
 
     def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
         # Each part may overwrite its gradient, so that all but the last get a copy.
         U_bars = chain((U_bar.copy() for _ in self.parts[1:]), [U_bar])
-        return self._each(prepared, values, U_bars, [diagonal_bar] * len(self.parts))
+        return self._addends(prepared, values, U_bars, [diagonal_bar] * len(self.parts))
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._finish(total, [K_bar] * len(self.parts))
@@ -411,12 +414,12 @@ class ProductAt(_CombinationAt):
     combine = staticmethod(mul)
 
     def slopes(self, prepared: Any) -> np.ndarray:
-        values = [part.at.cross(part.own(prepared))[:, :, np.newaxis] for part in self.parts]
-        return self._by_product_rule(values, [part.at.slopes(part.own(prepared)) for part in self.parts])
+        values = [part.at.cross(part.rows_of(prepared))[:, :, np.newaxis] for part in self.parts]
+        return self._by_product_rule(values, [part.at.slopes(part.rows_of(prepared)) for part in self.parts])
 
     def diagonal_slopes(self, prepared: Any) -> np.ndarray | float:
-        values = [np.asarray(part.at.diagonal(part.own(prepared)))[..., np.newaxis] for part in self.parts]
-        return self._by_product_rule(values, [part.at.diagonal_slopes(part.own(prepared)) for part in self.parts])
+        values = [np.asarray(part.at.diagonal(part.rows_of(prepared)))[..., np.newaxis] for part in self.parts]
+        return self._by_product_rule(values, [part.at.diagonal_slopes(part.rows_of(prepared)) for part in self.parts])
 
     def mixed_slopes(self, prepared: Any) -> np.ndarray:
         first, *others = (self._at_the_row(part, prepared) for part in self.parts)
@@ -431,20 +434,20 @@ class ProductAt(_CombinationAt):
     @staticmethod
     def _at_the_row(part: _Part, prepared: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return value k (n, 1), ∂k/∂x (n, d) and ∂²k/∂x ∂x'ᵀ (n, d, d) of a part at x' = x."""
-        own = part.own(prepared)
-        mixed = part.at.mixed_slopes(own)
+        rows = part.rows_of(prepared)
+        mixed = part.at.mixed_slopes(rows)
         n, d = mixed.shape[:2]
-        value = np.broadcast_to(part.at.diagonal(own), n)[:, np.newaxis]
-        return value, np.broadcast_to(0.5 * part.at.diagonal_slopes(own), (n, d)), mixed
+        value = np.broadcast_to(part.at.diagonal(rows), n)[:, np.newaxis]
+        return value, np.broadcast_to(0.5 * part.at.diagonal_slopes(rows), (n, d)), mixed
 
     @staticmethod
     def _by_product_rule(values: Sequence[Any], slopes: Sequence[Any]) -> Any:
-        return reduce(add, (reduce(mul, (*values[:i], *values[i + 1 :]), own) for i, own in enumerate(slopes)))
+        return reduce(add, (reduce(mul, (*values[:i], *values[i + 1 :]), slope) for i, slope in enumerate(slopes)))
 
     def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-        diagonals = [part.at.diagonal(part.own(prepared)) for part in self.parts]
+        diagonals = [part.at.diagonal(part.rows_of(prepared)) for part in self.parts]
         U_bars = _times_others(U_bar, [value for value, _ in values])
-        return self._each(prepared, values, U_bars, _times_others(diagonal_bar, diagonals))
+        return self._addends(prepared, values, U_bars, _times_others(diagonal_bar, diagonals))
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._finish(total, _times_others(K_bar, [part.at.matrix() for part in self.parts]))

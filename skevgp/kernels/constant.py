@@ -15,24 +15,24 @@ from .waves import Planes
 
 @dataclass(frozen=True)
 class Constant(Covariance):
-    """k̃(x, x') = c: the prior of an unknown offset. Hyperparameter log c."""
+    """k̃(x, x') = c: the prior of an unknown offset. Hyperparameter c."""
 
     n_hyperparameters = 1
     rows = staticmethod(no_columns)
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return np.full(np.broadcast_shapes(inputs.shape, others.shape)[:-1], np.exp(hyperparameters[0]))
+        return np.full(np.broadcast_shapes(inputs.shape, others.shape)[:-1], hyperparameters[0])
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ConstantAt:
-        return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points.shape)
+        return ConstantAt(float(hyperparameters[0]), inducing_points.shape)
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Planes]]:
-        return [(Planes(np.zeros(shape), np.full(shape[0], np.exp(0.5 * hyperparameters[0]))),)]
+        return [(Planes(np.zeros(shape), np.full(shape[0], np.sqrt(hyperparameters[0]))),)]
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, float]:
-        value = float(np.exp(hyperparameters[0]))
+        value = float(hyperparameters[0])
         return casadi().DM.ones(len(points)) * value, value
 
 

@@ -91,7 +91,7 @@ class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
 
 @dataclass(frozen=True)
 class Wave(Covariance):
-    """k̃(x, x') = cos(2π Σ_d (x_d - x'_d) / ℓ_d); hyperparameters log ℓ."""
+    """k̃(x, x') = cos(2π Σ_d (x_d - x'_d) / ℓ_d); hyperparameters ℓ."""
 
     n_columns: int
     isotropic: bool = False  # whether all columns have the same length scale
@@ -124,7 +124,7 @@ class Wave(Covariance):
 
     def frequencies(self, hyperparameters: np.ndarray) -> np.ndarray:
         """Return 2π / ℓ of each column."""
-        return np.broadcast_to(2.0 * np.pi * np.exp(-hyperparameters), self.n_columns)
+        return np.broadcast_to(2.0 * np.pi / hyperparameters, self.n_columns)
 
 
 class WaveAt(CovarianceAt):

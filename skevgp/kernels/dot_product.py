@@ -15,24 +15,24 @@ from .waves import Planes
 
 @dataclass(frozen=True)
 class DotProduct(Covariance):
-    """k̃(x, x') = σ₀² + xᵀx' (Rasmussen & Williams 2006, section 4.2.2). Hyperparameter log σ₀."""
+    """k̃(x, x') = σ₀² + xᵀx' (Rasmussen & Williams 2006, section 4.2.2). Hyperparameter σ₀."""
 
     n_hyperparameters = 1
     rows = staticmethod(as_they_are)
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return np.einsum("...d,...d->...", inputs, others) + np.exp(2.0 * hyperparameters[0])
+        return np.einsum("...d,...d->...", inputs, others) + hyperparameters[0] ** 2
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> DotProductAt:
-        return DotProductAt(float(np.exp(2.0 * hyperparameters[0])), inducing_points)
+        return DotProductAt(float(hyperparameters[0] ** 2), inducing_points)
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Planes]]:
-        return [(Planes(rng.standard_normal(shape), np.exp(hyperparameters[0]) * rng.standard_normal(shape[0])),)]
+        return [(Planes(rng.standard_normal(shape), hyperparameters[0] * rng.standard_normal(shape[0])),)]
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, Any]:
-        ca, bias = casadi(), float(np.exp(2.0 * hyperparameters[0]))
+        ca, bias = casadi(), float(hyperparameters[0] ** 2)
         return ca.mtimes(ca.DM(points), x) + bias, ca.sumsqr(x) + bias
 
 

@@ -114,9 +114,9 @@ class FunctionKernel(sk.Kernel):
         """
         names = self._defaults()
         super().set_params(**{name: value for name, value in params.items() if name not in names})
-        own = {name: float(params[name]) for name in names if name in params}
-        if own:
-            self.values = {**(self.values or {}), **own}
+        changed = {name: float(params[name]) for name in names if name in params}
+        if changed:
+            self.values = {**(self.values or {}), **changed}
         return self
 
     def __sklearn_clone__(self) -> Self:
@@ -134,7 +134,7 @@ class FunctionKernel(sk.Kernel):
         Returns
         -------
         covariance : Function
-            A function of the logarithms of the hyperparameters.
+            A function of the values of the hyperparameters.
         """
         return Function(self.function, tuple(self._values()), self.diagonal)
 
@@ -144,15 +144,16 @@ class FunctionKernel(sk.Kernel):
         if Y is not None and eval_gradient:
             raise ValueError("Gradient can only be evaluated when Y is None.")
         Z = X if Y is None else np.atleast_2d(Y)
-        covariance, start = self.covariance(), self._log_values()
-        K = np.asarray(covariance.values(start, X, Z), dtype=float)
+        covariance, values = self.covariance(), self._numbers()
+        K = np.asarray(covariance.values(values, X, Z), dtype=float)
         if not np.isfinite(K).all():
             raise ValueError(f"{name_of(self.function)} returned numbers that are not finite.")
         if not eval_gradient:
             return K
-        jvp = make_jvp(lambda hyper: covariance.values(hyper, X, X))(start)
+        jvp = make_jvp(lambda hyper: covariance.values(hyper, X, X))(values)
         free = np.array([not hyperparameter.fixed for hyperparameter in self.hyperparameters], dtype=bool)
-        gradient = [jvp(direction)[1] for direction in np.eye(len(start))[free]]
+        # ∂/∂ log h = h ∂/∂h: the direction of a hyperparameter has the length of its value.
+        gradient = [jvp(direction)[1] for direction in np.diag(values)[free]]
         return K, np.stack(gradient, axis=2) if gradient else np.empty((*K.shape, 0))
 
     def diag(self, X: Any) -> np.ndarray:
@@ -168,7 +169,7 @@ class FunctionKernel(sk.Kernel):
         diagonal : ndarray of shape (n,)
             Variances.
         """
-        return np.asarray(self.covariance().diagonal_values(self._log_values(), np.atleast_2d(X)), dtype=float)
+        return np.asarray(self.covariance().diagonal_values(self._numbers(), np.atleast_2d(X)), dtype=float)
 
     def is_stationary(self) -> bool:
         """Return False, because it is unknown whether the kernel depends on differences of inputs only.
@@ -202,8 +203,8 @@ class FunctionKernel(sk.Kernel):
             raise ValueError(f"Hyperparameters of {name_of(self.function)} must be positive; got {wrong}.")
         return values
 
-    def _log_values(self) -> np.ndarray:
-        return np.log(np.array(list(self._values().values()), dtype=float))
+    def _numbers(self) -> np.ndarray:
+        return np.array(list(self._values().values()), dtype=float)
 
     def _bounds(self, name: str) -> Any:
         if not isinstance(self.values_bounds, Mapping):
@@ -246,30 +247,30 @@ class Function(Covariance):
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
         shape = np.broadcast_shapes(inputs.shape, others.shape)
         inputs, others = (np.broadcast_to(rows, shape).reshape(-1, shape[-1]) for rows in (inputs, others))
-        found = np.empty(len(inputs))
+        covariances = np.empty(len(inputs))
         for first in range(0, len(inputs), _CHUNK):
-            own = slice(first, first + _CHUNK)
-            found[own] = np.diagonal(self.values(hyperparameters, inputs[own], others[own]))
-        return found.reshape(shape[:-1])
+            chunk = slice(first, first + _CHUNK)
+            covariances[chunk] = np.diagonal(self.values(hyperparameters, inputs[chunk], others[chunk]))
+        return covariances.reshape(shape[:-1])
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> FunctionAt:
         return FunctionAt(self, hyperparameters, inducing_points)
 
     def values(self, hyperparameters: Any, X: Any, Z: Any) -> Any:
-        """Return k(X, Z) (len(X), len(Z)) at log hyperparameters; ValueError if the function returns another shape."""
+        """Return k(X, Z), (len(X), len(Z)), at hyperparameters (n_hyper,); ValueError if it has another shape."""
         # The optimiser handles numbers that are not finite.
         with np.errstate(all="ignore"):
-            found = self.function(_own(X), _own(Z), **self._arguments(hyperparameters))
-        return self._checked(self.function, found, (len(X), len(Z)))
+            K = self.function(_copied(X), _copied(Z), **self._arguments(hyperparameters))
+        return self._checked(self.function, K, (len(X), len(Z)))
 
     def diagonal_values(self, hyperparameters: Any, X: Any) -> Any:
-        """Return k(x, x) of each row, (len(X),), at log hyperparameters."""
+        """Return k(x, x) of each row, (len(X),), at hyperparameters (n_hyper,)."""
         if self.diagonal is None:
             chunks: Iterator[Any] = (X[first : first + _CHUNK] for first in range(0, len(X), _CHUNK))
             return anp.concatenate([anp.diag(self.values(hyperparameters, chunk, chunk)) for chunk in chunks])
         with np.errstate(all="ignore"):
-            found = self.diagonal(_own(X), **self._arguments(hyperparameters))
-        return self._checked(self.diagonal, found, (len(X),))
+            diagonal = self.diagonal(_copied(X), **self._arguments(hyperparameters))
+        return self._checked(self.diagonal, diagonal, (len(X),))
 
     def pulled_back(self, function: Callable[[Any], Any], argument: Any, bar: np.ndarray) -> Any:
         """Return the gradient in the argument, given that in the value; ValueError if autograd fails."""
@@ -292,13 +293,13 @@ class Function(Covariance):
         return self._traced(lambda: make_jvp(function)(rows)(direction)[1])
 
     def _arguments(self, hyperparameters: Any) -> dict[str, Any]:
-        return {name: anp.exp(hyperparameters[index]) for index, name in enumerate(self.names)}
+        return {name: hyperparameters[index] for index, name in enumerate(self.names)}
 
     @staticmethod
-    def _checked(function: Callable[..., Any], found: Any, shape: tuple[int, ...]) -> Any:
-        if np.shape(found) != shape:
-            raise ValueError(f"{name_of(function)} must return an array of shape {shape}; it has {np.shape(found)}.")
-        return found
+    def _checked(function: Callable[..., Any], values: Any, shape: tuple[int, ...]) -> Any:
+        if np.shape(values) != shape:
+            raise ValueError(f"{name_of(function)} must return an array of shape {shape}; it has {np.shape(values)}.")
+        return values
 
 
 class FunctionAt(CovarianceAt):
@@ -343,8 +344,8 @@ class FunctionAt(CovarianceAt):
             return covariance.pulled_back(slope, rows, np.ones(len(rows)))
 
         columns = range(prepared.shape[1])
-        each = [np.stack([of(prepared[i : i + _CHUNK], column) for column in columns], axis=2) for i in chunks]
-        return np.concatenate(each)
+        slopes = [np.stack([of(prepared[i : i + _CHUNK], column) for column in columns], axis=2) for i in chunks]
+        return np.concatenate(slopes)
 
     def start_pullback(self) -> Sums:
         return Sums((np.zeros_like(self.hyperparameters), np.zeros_like(self.inducing_points)))
@@ -368,14 +369,15 @@ class FunctionAt(CovarianceAt):
         hyper_bar, points_bar = self.covariance.pulled_back(
             lambda at: self.covariance.values(at[0], at[1], at[1]), (self.hyperparameters, self.inducing_points), K_bar
         )
-        return total[0] + hyper_bar, total[1] + points_bar
+        # From gradients in the values to those in the logarithms: ∂/∂ log h = h ∂/∂h.
+        return self.hyperparameters * (total[0] + hyper_bar), total[1] + points_bar
 
     @staticmethod
-    def _number(found: Any) -> np.ndarray:
-        return np.asarray(found, dtype=float)
+    def _number(value: Any) -> np.ndarray:
+        return np.asarray(value, dtype=float)
 
 
-def _own(rows: Any) -> Any:
+def _copied(rows: Any) -> Any:
     """Copy rows that may be the user's data, because the user's function may change them."""
     return rows.copy() if isinstance(rows, np.ndarray) else rows
 

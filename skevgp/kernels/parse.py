@@ -55,11 +55,11 @@ class KernelSpec:
 
     def as_given(self) -> KernelSpec:
         """Return the same kernel without learning; values that the user did not give are 1."""
-        starts, one = self.starts, np.ones(1)
+        starts = self.starts
         shape, signal = starts.hyperparameters, starts.signal
         if shape.value is None:
             shape = Start(np.ones(self.covariance.n_hyperparameters))
-        starts = Starts(shape, Start(one) if signal.value is None else signal, starts.noise)
+        starts = Starts(shape, Start(np.ones(1)) if signal.value is None else signal, starts.noise)
         return replace(self, starts=starts, stays=True)
 
     def to_sklearn(
@@ -114,15 +114,15 @@ class KernelSpec:
     def _order_in(self, tree: sk.Kernel) -> np.ndarray:
         """Return indices of a tree's theta in (hyperparameters of k̃, s², σ²)."""
         n_hyper = self.covariance.n_hyperparameters
-        following, found = iter(range(n_hyper)), list[int]()
+        following, order = iter(range(n_hyper)), list[int]()
         for kernel in _simple_kernels(tree):
             for hyperparameter in kernel.hyperparameters:
                 if kernel is self.signal or type(kernel) is sk.WhiteKernel:
-                    own = [n_hyper if kernel is self.signal else n_hyper + 1]
+                    indices = [n_hyper if kernel is self.signal else n_hyper + 1]
                 else:
-                    own = list(islice(following, hyperparameter.n_elements))
-                found += [] if hyperparameter.fixed else own
-        return np.array(found, dtype=int)
+                    indices = list(islice(following, hyperparameter.n_elements))
+                order += [] if hyperparameter.fixed else indices
+        return np.array(order, dtype=int)
 
 
 def _simple_kernels(tree: Any) -> Iterator[Any]:
@@ -136,16 +136,19 @@ def _simple_kernels(tree: Any) -> Iterator[Any]:
 
 def _fitted(kernel: sk.Kernel, rows: Iterator[Any], set_bounds: bool) -> sk.Kernel:
     """Copy a simple kernel with values (and bounds) from the next rows (value, lower, upper)."""
-    found = clone(kernel)
+    fitted = clone(kernel)
     for hyperparameter in kernel.hyperparameters:
-        own = np.array(list(islice(rows, hyperparameter.n_elements)))
+        numbers = np.array(list(islice(rows, hyperparameter.n_elements)))
+        values, bounds = numbers[:, 0], numbers[:, 1:]
         # Fixed parameters keep all their digits.
         if not hyperparameter.fixed:
-            one = len(own) == 1
-            found.set_params(**{hyperparameter.name: float(own[0, 0]) if one else own[:, 0]})
+            is_scalar = len(values) == 1
+            fitted.set_params(**{hyperparameter.name: float(values[0]) if is_scalar else values})
             if set_bounds:
-                found.set_params(**{f"{hyperparameter.name}_bounds": tuple(own[0, 1:].tolist()) if one else own[:, 1:]})
-    return found
+                fitted.set_params(
+                    **{f"{hyperparameter.name}_bounds": tuple(bounds[0].tolist()) if is_scalar else bounds}
+                )
+    return fitted
 
 
 def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) -> KernelSpec:
@@ -215,16 +218,16 @@ def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -
     if type(kernel) in (sk.Sum, sk.Product):
         kind = Sum if type(kernel) is sk.Sum else Product
         operands = _operands(kernel, type(kernel))
-        parts = [part for own in operands if (part := _covariance(own, signal, n_columns, starts)) is not None]
+        parts = [part for operand in operands if (part := _covariance(operand, signal, n_columns, starts)) is not None]
         return kind(tuple(parts)) if len(parts) > 1 else parts[0]
     if type(kernel) not in READERS:
         raise ValueError(
             f"kernel: {type(kernel).__name__} does not work in this place, as {kernel!r}. These work: "
             f"{known_kernels()}."
         )
-    found = READERS[type(kernel)](kernel, n_columns)
+    covariance = READERS[type(kernel)](kernel, n_columns)
     starts.append(_starts(kernel))
-    return found
+    return covariance
 
 
 def _operands(kernel: Any, operator: Any) -> Iterator[Any]:

@@ -19,10 +19,9 @@ _HARMONICS = 10_000
 
 @dataclass(frozen=True)
 class ExpSineSquared(Profile):
-    """φ = exp(-2 sin²(π r) / ℓ²), r = |x - x'| / period (Rasmussen & Williams 2006, eq. 4.31). Parameter log ℓ."""
+    """φ = exp(-2 sin²(π r) / ℓ²), r = |x - x'| / period (Rasmussen & Williams 2006, eq. 4.31). Parameter ℓ."""
 
     n_parameters = 1
-    smooth = True
     has_root = True
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -33,13 +32,13 @@ class ExpSineSquared(Profile):
         # d sin²(π r) / dE = -π sin(2π r) / r, finite at r = 0.
         slope = np.sinc(2.0 * r)
         slope *= value
-        slope *= (2.0 * np.pi * np.exp(-parameters[0])) ** 2
+        slope *= (2.0 * np.pi / parameters[0]) ** 2
         return slope, [4.0 * self._squared(r, parameters) * value]
 
     @staticmethod
     def _squared(r: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return sin²(π r) / ℓ²."""
-        return (np.sin(np.pi * r) * np.exp(-parameters[0])) ** 2
+        return (np.sin(np.pi * r) / parameters[0]) ** 2
 
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
@@ -48,14 +47,14 @@ class ExpSineSquared(Profile):
         if d > 1:
             raise ValueError(no_functions(f"{type(self).__name__} of {d} columns"))
         # The Fourier series of exp(z cos(2π r)) has Bessel functions I_j(z), z = 1 / ℓ² (DLMF 10.35.2).
-        share = ive(np.arange(_HARMONICS), float(np.exp(-2.0 * parameters[0])))
+        share = ive(np.arange(_HARMONICS), float(parameters[0] ** -2.0))
         share[1:] *= 2.0
         harmonics = rng.choice(_HARMONICS, size, p=share / share.sum())[:, np.newaxis].astype(float)
         return 2.0 * np.pi * harmonics, np.ones(size)
 
     def expression(self, squared: Any, parameters: np.ndarray) -> Any:
         ca = casadi()
-        return ca.exp(-2.0 * np.exp(-2.0 * parameters[0]) * ca.sin(np.pi * ca.sqrt(squared + TINY)) ** 2)
+        return ca.exp(-2.0 * parameters[0] ** -2.0 * ca.sin(np.pi * ca.sqrt(squared + TINY)) ** 2)
 
 
 @reads(sk.ExpSineSquared)

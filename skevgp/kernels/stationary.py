@@ -56,19 +56,17 @@ Derivatives = tuple[np.ndarray, list[np.ndarray]]
 
 
 class Profile(ABC):
-    """φ(E); the logarithms of its own parameters come before the length scales in the vector of hyperparameters."""
+    """φ(E); its own parameters come before the length scales in the vector of hyperparameters."""
 
+    # A subclass sets only what differs from these.
     n_parameters: ClassVar[int] = 0
+    # Whether φ takes the root of r², which then needs all its digits.
+    has_root: ClassVar[bool] = False
 
     @property
     def smooth(self) -> bool:
         """Whether φ'(E) is finite at E = 0."""
         return True
-
-    @property
-    def has_root(self) -> bool:
-        """Whether φ takes the root of r², which then needs all its digits."""
-        return False
 
     @abstractmethod
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -76,7 +74,7 @@ class Profile(ABC):
 
     @abstractmethod
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        """Return φ'(E) and the derivative in each log parameter, given φ(E)."""
+        """Return φ'(E) and the derivative in the logarithm of each parameter, given φ(E)."""
 
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
@@ -92,10 +90,6 @@ class Profile(ABC):
 @dataclass(frozen=True)
 class Exponential(Profile):
     """φ = exp(E): the squared exponential (Rasmussen & Williams 2006, eq. 4.9)."""
-
-    n_parameters = 0
-    smooth = True
-    has_root = False
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         return np.exp(E)
@@ -113,110 +107,10 @@ class Exponential(Profile):
 
 
 @dataclass(frozen=True)
-class Matern12(Profile):
-    """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
-
-    n_parameters = 0
-    smooth = False
-    has_root = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.exp(-np.sqrt(-2.0 * E))
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
-
-    def spectrum(
-        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return _student_t(0.5, shape, rng)
-
-    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        # A lower limit of r² above 0 keeps derivatives from being NaN.
-        ca = casadi()
-        return ca.exp(-ca.sqrt(ca.fmax(squared, 1e-60)))
-
-
-@dataclass(frozen=True)
-class Matern32(Profile):
-    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
-
-    n_parameters = 0
-    smooth = True
-    has_root = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-6.0 * E)
-        decay = np.exp(-t)
-        t += 1.0
-        t *= decay
-        return t
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-6.0 * E)
-        t += 1.0
-        np.divide(value, t, out=t)
-        t *= 3.0
-        return t, []
-
-    def spectrum(
-        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return _student_t(1.5, shape, rng)
-
-    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        ca = casadi()
-        t = ca.sqrt(3.0 * (squared + TINY))
-        return (1.0 + t) * ca.exp(-t)
-
-
-@dataclass(frozen=True)
-class Matern52(Profile):
-    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
-
-    n_parameters = 0
-    smooth = True
-    has_root = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-10.0 * E)
-        decay = np.exp(-t)
-        decay *= self._polynomial(E, t)
-        return decay
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-10.0 * E)
-        polynomial = self._polynomial(E, t)
-        t += 1.0
-        t *= 5.0 / 3.0
-        t *= value
-        t /= polynomial
-        return t, []
-
-    @staticmethod
-    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
-        polynomial = (-10.0 / 3.0) * E
-        polynomial += t
-        polynomial += 1.0
-        return polynomial
-
-    def spectrum(
-        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return _student_t(2.5, shape, rng)
-
-    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        ca, t2 = casadi(), 5.0 * (squared + TINY)
-        t = ca.sqrt(t2)
-        return (1.0 + t + t2 / 3.0) * ca.exp(-t)
-
-
-@dataclass(frozen=True)
 class Matern(Profile):
     """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r, ν up to `LARGEST_NU` (Rasmussen & Williams 2006, eq. 4.14)."""
 
     nu: float
-    n_parameters = 0
     has_root = True
 
     @property
@@ -240,10 +134,10 @@ class Matern(Profile):
         with np.errstate(all="ignore"):
             log_bessel = np.log(kve(order, np.minimum(positive, 1e3)))
         factor = (1.0 - self.nu) * np.log(2.0) - gammaln(self.nu)
-        found = np.exp(factor + order * np.log(positive) + log_bessel - positive)
+        values = np.exp(factor + order * np.log(positive) + log_bessel - positive)
         overflow = np.isinf(log_bessel) | (t == 0.0)
-        found[overflow] = at_zero * self._near_zero(t[overflow], order)
-        return found
+        values[overflow] = at_zero * self._near_zero(t[overflow], order)
+        return values
 
     @staticmethod
     def _near_zero(t: np.ndarray, order: float) -> np.ndarray:
@@ -277,21 +171,87 @@ class Matern(Profile):
 
 
 @dataclass(frozen=True)
-class RationalQuadratic(Profile):
-    """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter log α."""
+class Matern12(Matern):
+    """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
 
-    n_parameters = 1
-    smooth = True
-    has_root = False
+    nu: float = field(default=0.5, init=False)
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        alpha = np.exp(parameters[0])
+        return np.exp(-np.sqrt(-2.0 * E))
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        # A lower limit of r² above 0 keeps derivatives from being NaN.
+        ca = casadi()
+        return ca.exp(-ca.sqrt(ca.fmax(squared, 1e-60)))
+
+
+@dataclass(frozen=True)
+class Matern32(Matern):
+    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    nu: float = field(default=1.5, init=False)
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        t = np.sqrt(-6.0 * E)
+        decay = np.exp(-t)
+        t += 1.0
+        t *= decay
+        return t
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-6.0 * E)
+        t += 1.0
+        np.divide(value, t, out=t)
+        t *= 3.0
+        return t, []
+
+
+@dataclass(frozen=True)
+class Matern52(Matern):
+    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    nu: float = field(default=2.5, init=False)
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        t = np.sqrt(-10.0 * E)
+        decay = np.exp(-t)
+        decay *= self._polynomial(E, t)
+        return decay
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-10.0 * E)
+        polynomial = self._polynomial(E, t)
+        t += 1.0
+        t *= 5.0 / 3.0
+        t *= value
+        t /= polynomial
+        return t, []
+
+    @staticmethod
+    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
+        polynomial = (-10.0 / 3.0) * E
+        polynomial += t
+        polynomial += 1.0
+        return polynomial
+
+
+@dataclass(frozen=True)
+class RationalQuadratic(Profile):
+    """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter α."""
+
+    n_parameters = 1
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        alpha = parameters[0]
         log = np.log1p(self._ratio(E, alpha))
         log *= -alpha
         return np.exp(log, out=log)
 
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        alpha = np.exp(parameters[0])
+        alpha = parameters[0]
         ratio = self._ratio(E, alpha)
         from_alpha = ratio / (1.0 + ratio)
         from_alpha -= np.log1p(ratio)
@@ -311,14 +271,14 @@ class RationalQuadratic(Profile):
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
         # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): normals whose variance has a gamma distribution.
-        (size, d), alpha, normals = shape, float(np.exp(parameters[0])), rng.standard_normal(shape)
+        (size, d), alpha, normals = shape, float(parameters[0]), rng.standard_normal(shape)
         drawn = normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis]
         if alpha > _LARGE_ALPHA:
             return drawn, np.ones(size)
         return widened(drawn, _variance_gamma(alpha, d), _MUCH_WIDER)
 
     def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        ca, alpha = casadi(), float(np.exp(parameters[0]))
+        ca, alpha = casadi(), float(parameters[0])
         return ca.exp(-alpha * ca.log1p(squared / (2.0 * alpha)))
 
 
@@ -345,7 +305,7 @@ def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
 
 @dataclass(frozen=True)
 class Stationary(Covariance):
-    """k̃(x, x') = φ(-½ Σ_d ((x_d - x'_d) / ℓ_d)²); hyperparameters: those of φ, then log ℓ."""
+    """k̃(x, x') = φ(-½ Σ_d ((x_d - x'_d) / ℓ_d)²); hyperparameters: those of φ, then ℓ."""
 
     profile: Profile  # φ
     n_columns: int
@@ -358,52 +318,56 @@ class Stationary(Covariance):
 
     @property
     def lengthscale_mask(self) -> np.ndarray:
-        own = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
-        return own & (not self.isotropic)
+        is_length = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
+        return is_length & (not self.isotropic)
 
     def centred(self, centre: np.ndarray) -> Stationary:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
-        scaled = (inputs - others) * np.exp(-lengths)
-        return self.profile.value(-0.5 * np.einsum("...d,...d->...", scaled, scaled), own)
+        parameters, lengthscales = self._split(hyperparameters)
+        scaled = (inputs - others) / lengthscales
+        return self.profile.value(-0.5 * np.einsum("...d,...d->...", scaled, scaled), parameters)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
-        return StationaryAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
+        points = self.rows.centred(inducing_points)
+        return StationaryAt(self.profile, *self._split(hyperparameters), points, self.isotropic)
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Waves]]:
-        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
-        frequencies, weights = self.profile.spectrum(own, shape, rng)
-        return [(Waves.drawn(frequencies * np.exp(-lengths), weights, self.rows, rng),)]
+        parameters, lengthscales = self._split(hyperparameters)
+        frequencies, weights = self.profile.spectrum(parameters, shape, rng)
+        return [(Waves.drawn(frequencies / lengthscales, weights, self.rows, rng),)]
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, float]:
         ca, x = casadi(), self.rows.symbol(x)
-        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
-        lengths = np.full(self.n_columns, np.exp(lengths))
-        scaled = self.rows.centred(points) / lengths
+        parameters, lengthscales = self._split(hyperparameters)
+        scaled = self.rows.centred(points) / lengthscales
         if self.profile.has_root:
             # Differences keep all digits if r² is small.
-            squared = ca.sum2((ca.DM(scaled) - ca.repmat((x / ca.DM(lengths)).T, len(scaled), 1)) ** 2)
+            squared = ca.sum2((ca.DM(scaled) - ca.repmat((x / ca.DM(lengthscales)).T, len(scaled), 1)) ** 2)
         else:
             # One product that is linear in [x, x²], as in predictions, has small derivatives.
-            factor = np.hstack([-2.0 * scaled / lengths, np.broadcast_to(lengths**-2.0, scaled.shape)])
+            factor = np.hstack([-2.0 * scaled / lengthscales, np.broadcast_to(lengthscales**-2.0, scaled.shape)])
             squared = ca.mtimes(ca.DM(factor), ca.vertcat(x, x**2)) + ca.DM((scaled**2).sum(axis=1))
-        return self.profile.expression(squared, own), 1.0
+        return self.profile.expression(squared, parameters), 1.0
+
+    def _split(self, hyperparameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parameters of φ, and the length scale of each column (d,)."""
+        parameters, lengthscales = np.split(hyperparameters, [self.profile.n_parameters])
+        return parameters, np.full(self.n_columns, lengthscales)
 
 
 class StationaryAt(CovarianceAt):
-    """A `Stationary` at given hyperparameters and centred inducing points (m, d)."""
+    """A `Stationary` at given parameters of φ, length scales (d,) and centred inducing points (m, d)."""
 
-    def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
-        lengthscales = np.exp(hyperparameters[profile.n_parameters :])
-        self.profile, self.parameters = profile, hyperparameters[: profile.n_parameters]
-        self.isotropic = len(lengthscales) < points.shape[1]
-        d, self.points = points.shape[1], points
-        self.lengthscales = np.full(d, lengthscales)
-        precision = self.lengthscales**-2.0
+    def __init__(
+        self, profile: Profile, parameters: np.ndarray, lengthscales: np.ndarray, points: np.ndarray, isotropic: bool
+    ):
+        self.profile, self.parameters, self.lengthscales = profile, parameters, lengthscales
+        self.points, self.isotropic = points, isotropic
+        d, precision = points.shape[1], lengthscales**-2.0
         self._exponent = np.empty((len(points), 2 * d + 1))
         self._exponent[:, :d] = points * precision
         self._exponent[:, d] = -0.5 * (points**2 @ precision)
@@ -433,17 +397,17 @@ class StationaryAt(CovarianceAt):
 
     def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
         slopes, others = self._derivatives(*self._exponents(prepared), U)
-        own = np.array([np.vdot(U_bar, other) for other in others])
+        parameters_bar = np.array([np.vdot(U_bar, other) for other in others])
         np.multiply(U_bar, slopes, out=U_bar)
-        return Sums((U_bar @ prepared.T, own))
+        return Sums((U_bar @ prepared.T, parameters_bar))
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows, own = total
+        rows, parameters_bar = total
         size = -2.0 * float(self._exponent[:, self.points.shape[1]].min())
         slopes, others = self._derivatives(self._exponents_within(), size, self.matrix())
-        own = own + np.array([np.vdot(K_bar, other) for other in others])
+        parameters_bar = parameters_bar + np.array([np.vdot(K_bar, other) for other in others])
         length_bar, Z_bar = self._geometry_bar(rows, K_bar * slopes)
-        return np.concatenate([own, length_bar]), Z_bar
+        return np.concatenate([parameters_bar, length_bar]), Z_bar
 
     def _geometry_bar(self, rows: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return gradients in log ℓ and X_m from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
@@ -482,12 +446,13 @@ class StationaryAt(CovarianceAt):
 
 @dataclass(frozen=True)
 class SquaredExponential(Stationary):
-    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9)."""
+    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters ℓ (Rasmussen & Williams 2006, eq. 4.9)."""
 
     profile: Profile = field(default=Exponential(), init=False)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
-        return SquaredExponentialAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
+        points = self.rows.centred(inducing_points)
+        return SquaredExponentialAt(self.profile, *self._split(hyperparameters), points, self.isotropic)
 
 
 class SquaredExponentialAt(StationaryAt):

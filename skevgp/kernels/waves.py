@@ -79,21 +79,21 @@ class RandomFunctions:
 
     def value(self, X: np.ndarray) -> np.ndarray:
         """Return Φ at rows (n, d), (L * n_terms, n)."""
-        found = np.concatenate([reduce(mul, (each.value(X) for each in term)) for term in self.terms])
-        return found * self._scale(found)
+        values = np.concatenate([reduce(mul, (factor.value(X) for factor in term)) for term in self.terms])
+        return values * self._scale(values)
 
     def slopes(self, X: np.ndarray) -> np.ndarray:
         """Return ∂Φ/∂x, (L * n_terms, n, d)."""
-        found = np.concatenate([_product_rule(term, X) for term in self.terms])
-        return found * self._scale(found)
+        slopes = np.concatenate([_product_rule(term, X) for term in self.terms])
+        return slopes * self._scale(slopes)
 
-    def _scale(self, found: np.ndarray) -> float:
-        return float(np.sqrt(len(self.terms) / len(found)))
+    def _scale(self, functions: np.ndarray) -> float:
+        return float(np.sqrt(len(self.terms) / len(functions)))
 
 
 def _product_rule(factors: tuple[Factor, ...], X: np.ndarray) -> np.ndarray:
-    values = [each.value(X)[:, :, np.newaxis] for each in factors] if len(factors) > 1 else []
-    parts = (reduce(mul, (*values[:i], *values[i + 1 :]), each.slopes(X)) for i, each in enumerate(factors))
+    values = [factor.value(X)[:, :, np.newaxis] for factor in factors] if len(factors) > 1 else []
+    parts = (reduce(mul, (*values[:i], *values[i + 1 :]), factor.slopes(X)) for i, factor in enumerate(factors))
     return sum(parts)  # type: ignore[return-value]
 
 
@@ -113,5 +113,5 @@ def widened(
     size, d = frequencies.shape
     frequencies = frequencies * widths[np.arange(size) % len(widths), np.newaxis]
     squares = np.einsum("ld,ld->l", frequencies, frequencies)
-    each = log_density(squares[:, np.newaxis] / widths**2) - d * np.log(widths)
-    return frequencies, len(widths) * np.exp(log_density(squares) - np.logaddexp.reduce(each, axis=1))
+    log_densities = log_density(squares[:, np.newaxis] / widths**2) - d * np.log(widths)
+    return frequencies, len(widths) * np.exp(log_density(squares) - np.logaddexp.reduce(log_densities, axis=1))

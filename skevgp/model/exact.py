@@ -219,7 +219,7 @@ class ExactModel:
 
     def outputs(self, values: Values) -> OutputsGivenKernel:
         """The kernel at the rows, for all outputs or for each, and each output given it."""
-        hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
+        hyperparameters, o = values["hyperparameters"], len(self.vague)
         prior = self.prior.at(values)
         rows_by_output = [self.rows.of(slice(output, output + 1)) for output in range(o)]
         relative = None if self.rows.precision is None else 1.0 / self.rows.precision

@@ -337,7 +337,7 @@ class Predictor:
         p = common.shape[1]
         for group, rows in zip(self.groups, projected, strict=True):
             V = rows.P[: len(group.points)]
-            K = group.kernel.at(np.log(group.hyperparameters), rows.inputs).matrix()
+            K = group.kernel.at(group.hyperparameters, rows.inputs).matrix()
             prior, unexplained = diagonal_of(K), K - V.T @ V
             matrices, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
             for matrix, sizes_of_output, signal, root in zip(matrices, terms, group.signal, group.root, strict=True):

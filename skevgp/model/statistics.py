@@ -50,7 +50,7 @@ class Whitening:
         cls, kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray, jitter: Jitter = JITTER
     ) -> Whitening:
         """The whitening for hyperparameters (n_hyper,) and inducing points (m, d)."""
-        covariance = kernel.at(np.log(hyperparameters), inducing_points)
+        covariance = kernel.at(hyperparameters, inducing_points)
         L = cholesky_of_covariance(covariance.matrix(), jitter)
         return cls(covariance, L, triangular_inverse(L))
 

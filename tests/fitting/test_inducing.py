@@ -7,7 +7,7 @@ from skevgp.kernels.stationary import SquaredExponential
 
 
 def points(X, n_inducing, method="k-means", lengthscale=1.0, seed=0):
-    kernel, hyperparameters = SquaredExponential(X.shape[1]), np.log(np.full(X.shape[1], lengthscale))
+    kernel, hyperparameters = SquaredExponential(X.shape[1]), np.full(X.shape[1], lengthscale)
     return Placement(method, n_inducing).points(X, kernel, hyperparameters, np.random.RandomState(seed))
 
 
@@ -57,7 +57,7 @@ def test_greedy_takes_the_row_of_largest_conditional_variance():
 
 
 def more(Z, n_inducing, X, lengthscale=1.5):
-    return with_more(Z, n_inducing, X, SquaredExponential(X.shape[1]), np.log(np.full(X.shape[1], lengthscale)))
+    return with_more(Z, n_inducing, X, SquaredExponential(X.shape[1]), np.full(X.shape[1], lengthscale))
 
 
 def test_more_points_are_the_least_known_from_points_that_are_no_rows():

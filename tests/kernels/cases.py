@@ -68,10 +68,10 @@ KERNELS = {**SIMPLE, **COMPOSITE}
 
 
 def parsed(kernel, centre=None):
-    """k̃ of a kernel that shall not lose its outermost constant, and its log hyperparameters."""
+    """k̃ of a kernel that shall not lose its outermost constant, and its hyperparameters."""
     spec = parse_kernel(sk.ConstantKernel() * kernel, 2)
     covariance = spec.covariance if centre is None else spec.covariance.centred(np.asarray(centre, dtype=float))
-    return covariance, np.log(spec.starts.hyperparameters.value)
+    return covariance, spec.starts.hyperparameters.value
 
 
 def scalar(covariance, hyperparameters, points, inputs, bars):
@@ -82,7 +82,7 @@ def scalar(covariance, hyperparameters, points, inputs, bars):
 
 
 def pulled_back(covariance, hyperparameters, points, inputs, bars, n_blocks=2):
-    """Gradients of `scalar` in hyperparameters and points."""
+    """Gradients of `scalar` in log hyperparameters and points."""
     at = covariance.at(hyperparameters, points)
     total = at.start_pullback()
     for rows in np.array_split(np.arange(len(inputs)), n_blocks):

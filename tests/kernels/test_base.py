@@ -49,7 +49,7 @@ def test_sums_share_prepared_rows(covariance, preparations):
 )
 @pytest.mark.parametrize("centre", [None, CENTRE])
 def test_sums_and_products_are_those_of_the_parts(covariance, centre):
-    hyperparameters = np.linspace(-0.5, 0.5, covariance.n_hyperparameters)
+    hyperparameters = np.linspace(0.6, 1.6, covariance.n_hyperparameters)
     if centre is not None:
         covariance = covariance.centred(centre)
 

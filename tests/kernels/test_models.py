@@ -76,7 +76,7 @@ def test_value_of_a_bound_that_depends_on_the_diagonal():
 def test_kernels_that_do_not_work_on_the_points_say_why(kernel, message):
     covariance, hyperparameters = parsed(kernel)
     with pytest.raises(ValueError, match=message):
-        checked_variance(covariance, np.exp(hyperparameters), Z)
+        checked_variance(covariance, hyperparameters, Z)
 
 
 # --- in an estimator ---------------------------------------------------------------------------------------------

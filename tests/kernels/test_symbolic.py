@@ -25,10 +25,10 @@ ROUGH = sk.Matern(0.9, nu=0.5)
 
 def symbolic(kernel, points=Z, centre=None):
     """x -> (k̃(X_m, x), k̃(x, x)), and the same in NumPy, row by row."""
-    covariance, log_hyperparameters = parsed(kernel, centre)
+    covariance, hyperparameters = parsed(kernel, centre)
     x = ca.MX.sym("x", points.shape[1])
-    function = ca.Function("k", [x], list(covariance.expression(log_hyperparameters, points, x)))
-    at = covariance.at(log_hyperparameters, points)
+    function = ca.Function("k", [x], list(covariance.expression(hyperparameters, points, x)))
+    at = covariance.at(hyperparameters, points)
 
     def numeric(row):
         prepared = covariance.prepare(row.reshape(1, -1))

@@ -27,7 +27,7 @@ X = np.random.RandomState(0).uniform(-1.5, 1.5, (12, 2))
 def drawn(kernel, n_columns=2, size=SIZE, centre=None):
     spec = parse_kernel(sk.ConstantKernel() * kernel, n_columns)
     covariance = spec.covariance if centre is None else spec.covariance.centred(centre)
-    hyperparameters = np.log(spec.starts.hyperparameters.value)
+    hyperparameters = spec.starts.hyperparameters.value
     return random_functions(covariance, hyperparameters, size, n_columns, np.random.RandomState(1))
 
 
