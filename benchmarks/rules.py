@@ -70,7 +70,6 @@ from skevgp.fitting import (
     rules,
     search,
     sharing,
-    start,
     units,
 )
 from skevgp.fitting import prior as priors
@@ -79,6 +78,7 @@ from skevgp.metrics import negative_log_predictive_density
 from skevgp.model import left_out
 from skevgp.model import model as sparse
 from skevgp.solvers import base, lbfgs
+from skevgp.utils.linalg import Jitter
 
 CSV = Path(__file__).parent / "results" / "rules.csv"
 COLUMNS = ["rule", "problem", "seed", "bound", "rmse", "nlpd", "seconds", "failure", "warning"]
@@ -151,6 +151,11 @@ def nothing(*args: Any, **options: Any) -> None:
     """Return None."""
 
 
+def always(*args: Any, **options: Any) -> bool:
+    """Return True."""
+    return True
+
+
 def never(*args: Any, **options: Any) -> bool:
     """Return False."""
     return False
@@ -212,7 +217,7 @@ RULES_OFF = {
     "below": Rule("a fit below the features counts as collapsed", (constant(search.Search, "_below", never),)),
     "root-d": Rule(
         "first length scales grow with √d",
-        (edited(start, "starting_table", "root_d = np.sqrt(scale.shape[-1])", "root_d = 1.0"),),
+        (edited(parts, "starting_table", "root_d = np.sqrt(scale.shape[-1])", "root_d = 1.0"),),
     ),
     # L-BFGS.
     "curvature": Rule(
@@ -245,6 +250,10 @@ RULES_OFF = {
         "an own class for the squared exponential",
         (constant(stationary.SquaredExponential, "at", stationary.Stationary.at),),
     ),
+    "jitter": Rule("a jitter for nearly singular K", (field(jitter=Jitter(size=0.0)),), "sparse complete"),
+    "jitter-if-needed": Rule(
+        "no jitter for other K", (field(jitter=Jitter(well_conditioned=np.inf)),), "sparse complete"
+    ),
     # Inducing points.
     "equal-rows": Rule(
         "rows that are equal to ten digits are one",
@@ -263,7 +272,7 @@ RULES_OFF = {
         "constants have almost no signal in a fit",
         (
             edited(
-                start,
+                parts,
                 "starting_table",
                 "np.where(np.logical_and(constant, not still), rules.signal_limits[0], 1.0) * signal",
                 "signal",
@@ -281,7 +290,7 @@ RULES_OFF = {
         "the noise of constants starts lowest",
         (
             edited(
-                start,
+                parts,
                 "starting_table",
                 "np.where(constant, lowest_noise, rules.first_noise * scatter)",
                 "np.maximum(rules.first_noise * scatter, lowest_noise)",
@@ -291,7 +300,7 @@ RULES_OFF = {
     ),
     "widest-noise": Rule(
         "the noise may rise to the variance of y",
-        (edited(start, "starting_table", "np.maximum(highest, units.target_scatter[own] * precision)", "None"),),
+        (edited(parts, "starting_table", "np.maximum(highest, units.target_scatter[own] * precision)", "None"),),
         "features",
     ),
     "moderate-prior": Rule("a moderate prior for few rows", (constant(problem, "_ENOUGH", 0),), "features"),
@@ -376,6 +385,12 @@ RULES_OFF = {
         "a parabola through the best points", (constant(calibration, "_vertex", lambda *losses: 0.0),), "folds groups"
     ),
     "dependent": Rule("a test of neighbouring rows", (constant(calibration, "_dependent", never),), "folds"),
+    "path-test": Rule(
+        "blocks that are predicted worse must be a path",
+        (constant(calibration, "follow_a_path", always),),
+        "folds",
+    ),
+    "ends-of-blocks": Rule("ends of blocks are not predicted", (constant(folds, "_GAP", 0.0),), "groups"),
     "largest-group": Rule("a group of most rows is cut", (constant(folds, "_LARGEST_SHARE", 2.0),), "groups"),
     "no-folds-if-exact": Rule(
         "the exact model is not calibrated by random folds",
@@ -656,6 +671,11 @@ def many_outputs(n: int, extra: tuple[str, ...]) -> Callable[[int], tuple[np.nda
     return make
 
 
+def constants(seed: int) -> tuple[np.ndarray, ...]:
+    X, Y, X_new, Y_new = many_outputs(200, ("constant",))(seed)
+    return X, Y[:, [0, 3]], X_new, Y_new[:, [0, 3]]
+
+
 def of_groups(n_groups: int, shift: float, noise: float = 0.1) -> Callable[[int], tuple[np.ndarray, ...]]:
     """Rows of groups, each with a shift of its own and a slow path."""
 
@@ -694,6 +714,21 @@ def outlying(
         errors = size * rng.randn(len(rows))
         y[rows] += abs(errors) if one_sided else errors
         return X, y, X_new, y_new
+
+    return make
+
+
+def steep(d: int, share: float, size: float, one_sided: bool) -> Callable[[int], tuple[np.ndarray, ...]]:
+    """Outliers of a function for which medians of neighbours are bad predictions."""
+
+    def make(seed: int) -> tuple[np.ndarray, ...]:
+        rng = np.random.RandomState(seed)
+        X = rng.uniform(-3.0, 3.0, (900, d))
+        y = np.sin(X[:, 0]) + 3.0 * X.sum(axis=1)
+        y_old = y[:300] + 0.1 * rng.randn(300)
+        errors = size * rng.randn(300)
+        y_old += np.where(rng.rand(300) < share, abs(errors) if one_sided else errors, 0.0)
+        return X[:300], y_old, X[300:], y[300:]
 
     return make
 
@@ -750,6 +785,15 @@ def polynomial(seed: int) -> tuple[np.ndarray, ...]:
     return X[:100], y[:100], X[100:], y[100:]
 
 
+def sorted_rows(seed: int) -> tuple[np.ndarray, ...]:
+    """Independent rows, sorted by y: blocks of them are predicted worse."""
+    rng = np.random.RandomState(seed)
+    X = rng.uniform(-1.0, 1.0, (800, 2))
+    y = np.exp(X[:, 0]) + 0.3 * rng.randn(800)
+    order = np.argsort(y[:400])
+    return X[:400][order], y[:400][order], X[400:], y[400:]
+
+
 def pure_noise(seed: int) -> tuple[np.ndarray, ...]:
     rng = np.random.RandomState(seed)
     return rng.randn(200, 3), rng.randn(200), rng.randn(300, 3), rng.randn(300)
@@ -763,6 +807,18 @@ def fast_waves(seed: int) -> tuple[np.ndarray, ...]:
     return X[:150], y[:150] + 0.1 * rng.randn(150), X[150:], y[150:]
 
 
+def faster(speed: float) -> Callable[[int], tuple[np.ndarray, ...]]:
+    """Waves that ten points see as noise."""
+
+    def make(seed: int) -> tuple[np.ndarray, ...]:
+        rng = np.random.RandomState(seed)
+        X = rng.uniform(0.0, 1.0, (1000, 1))
+        y = np.sin(2.0 * speed * X[:, 0])
+        return X[:500], y[:500] + 0.3 * rng.randn(500), X[500:], y[500:]
+
+    return make
+
+
 def ratio_1e8(n: int) -> Callable[[int], tuple[np.ndarray, ...]]:
     def make(seed: int) -> tuple[np.ndarray, ...]:
         return drawn(n, 2, 1e-4, seed)
@@ -773,6 +829,12 @@ def ratio_1e8(n: int) -> Callable[[int], tuple[np.ndarray, ...]]:
 def noise_free_duplicates(seed: int) -> tuple[np.ndarray, ...]:
     X, y, X_new, y_new = drawn(40, 1, 0.0, seed)
     return np.repeat(X, 2, axis=0), np.repeat(y, 2), X_new, y_new
+
+
+def nearly_duplicates(seed: int) -> tuple[np.ndarray, ...]:
+    """Rows without noise that differ from others by rounding only."""
+    X, y, X_new, y_new = drawn(40, 1, 0.0, seed)
+    return np.vstack([X, X * (1.0 + 1e-14)]), np.tile(y, 2), X_new, y_new
 
 
 def fixed_signal(seed: int) -> Job:
@@ -861,6 +923,14 @@ def very_fast(seed: int) -> tuple[np.ndarray, ...]:
     return X[:4000], y[:4000] + 0.5 * rng.randn(4000), X[4000:], y[4000:]
 
 
+def weak_signal(seed: int) -> tuple[np.ndarray, ...]:
+    """A signal that a sample is too small to show."""
+    rng = np.random.RandomState(seed)
+    X = rng.uniform(-1.0, 1.0, (9000, 3))
+    y = np.sin(3.0 * X[:, 0]) + X[:, 1] ** 2
+    return X[:8000], y[:8000] + 8.0 * rng.randn(8000), X[8000:], y[8000:]
+
+
 def apart(seed: int) -> tuple[np.ndarray, ...]:
     """Outputs of two kinds of kernels, of very different sizes."""
     rng = np.random.RandomState(seed)
@@ -926,10 +996,18 @@ PROBLEMS = {
     "features-at-1e8": Problem(simple(far_features(1e8, 1.0), features=poly(2)), "sparse folds features"),
     "duplicates": Problem(simple(duplicates, m=100), "complete folds"),
     "noise-free-duplicates": Problem(simple(noise_free_duplicates, m=100), "complete folds"),
+    "nearly-duplicates": Problem(simple(nearly_duplicates, m=100), "complete folds"),
     "constant-output": Problem(simple(many_outputs(200, ("constant",)), sharing="all"), "sparse folds constant"),
     "constant-auto": Problem(
         simple(many_outputs(200, ("constant", "noise", "noise-free"))), "sparse folds constant sharing"
     ),
+    "constant-normalized": Problem(
+        simple(many_outputs(200, ("constant",)), sharing="all", normalize_y=True), "sparse folds constant"
+    ),
+    "constant-normalized-auto": Problem(
+        simple(many_outputs(200, ("constant", "noise")), normalize_y=True), "sparse folds constant sharing"
+    ),
+    "constant-alone": Problem(simple(constants, normalize_y=True, sharing="kernel"), "sparse folds constant"),
     "ratio-1e8": Problem(simple(ratio_1e8(300), m=60), "sparse folds"),
     "ratio-1e8-all-rows": Problem(simple(ratio_1e8(80)), "complete folds"),
     "groups": Problem(simple(of_groups(8, 0.0)), "sparse groups"),
@@ -944,9 +1022,17 @@ PROBLEMS = {
     "student-bump": Problem(simple(bump, noise="student-t"), "sparse folds robust"),
     "student-classes": Problem(simple(classes, noise="student-t"), "sparse folds robust"),
     "student-few": Problem(simple(outlying(0.1, 10.0, n=30), noise="student-t"), "robust complete"),
+    "student-steep": Problem(simple(steep(5, 0.1, 5.0, False), noise="student-t"), "sparse folds robust"),
+    "student-steep-one-side": Problem(simple(steep(2, 0.15, 1.0, True), noise="student-t"), "sparse folds robust"),
+    "student-many": Problem(simple(outlying(0.35, 10.0), noise="student-t"), "sparse folds robust"),
+    "student-3000": Problem(simple(outlying(0.1, 3.0, n=3000), noise="student-t"), "sparse folds robust"),
     "student-two": Problem(simple(two_outputs_with_outliers, noise="student-t"), "sparse folds robust"),
     "auto": Problem(simple(lambda seed: drawn(300, 2, 0.05, seed), m="auto"), "sparse folds auto"),
     "auto-fast": Problem(simple(fast_waves, m="auto"), "sparse folds auto"),
+    "auto-very-fast": Problem(simple(faster(60.0), m="auto"), "sparse folds auto"),
+    "auto-plane": Problem(simple(lambda seed: drawn(800, 4, 0.3, seed), m="auto"), "sparse folds auto"),
+    "auto-irrelevant": Problem(simple(irrelevant(500, 0.1), m="auto"), "sparse folds auto"),
+    "auto-sines": Problem(simple(sines, m="auto"), "sparse folds auto"),
     "exact": Problem(exact_job(lambda seed: drawn(150, 2, 0.1, seed)), "exact"),
     "exact-features": Problem(exact_job(as_wide_as_long, feature_map=poly(1)), "exact features"),
     "exact-noise-free": Problem(exact_job(polynomial), "exact"),
@@ -955,6 +1041,7 @@ PROBLEMS = {
     "irrelevant-many": Problem(simple(irrelevant(3000, 0.3), m=15), "sparse folds many"),
     "sines": Problem(simple(sines), "sparse folds"),
     "polynomial": Problem(simple(polynomial), "sparse folds"),
+    "sorted": Problem(simple(sorted_rows), "sparse folds"),
     "noise": Problem(simple(pure_noise), "sparse folds"),
     "fast-waves": Problem(simple(fast_waves, m=40), "sparse folds"),
     "periodic": Problem(periodic, "complete folds"),
@@ -965,6 +1052,7 @@ PROBLEMS = {
     "sixty-features": Problem(simple(sixty_features, features=poly(1), normalize_y=True), "complete features wide"),
     "missed-column": Problem(simple(missed_column, m=30), "sparse folds many"),
     "very-fast": Problem(simple(very_fast, m=60), "sparse folds many"),
+    "weak-signal": Problem(simple(weak_signal, m=20), "sparse folds many"),
     "parabola": Problem(simple(parabola), "complete folds"),
     "parabola-30": Problem(simple(parabola, m=30), "sparse folds"),
     "phases": Problem(simple(phases, m=60), "sparse groups"),
@@ -1045,7 +1133,7 @@ def run(options: argparse.Namespace) -> None:
 def table(frame: pd.DataFrame) -> pd.DataFrame:
     """The worst effects of each rule's absence, and how often nothing changed."""
     key = ["problem", "seed"]
-    frame = frame.fillna({"failure": "", "warning": ""})
+    frame = frame.assign(failure=frame.failure.fillna("").astype(str), warning=frame.warning.fillna("").astype(str))
     with_rules = frame[frame.rule == "none"].set_index(key)
     lines = []
     for rule in dict.fromkeys(frame.rule):
@@ -1059,7 +1147,7 @@ def table(frame: pd.DataFrame) -> pd.DataFrame:
         ratio = (np.maximum(own.rmse, 1e-6) / np.maximum(base_line.rmse, 1e-6)).fillna(1.0)
         nlpd = (own.nlpd - base_line.nlpd).fillna(0.0)
         changed = (abs(loss) > 1e-9) | (abs(ratio - 1.0) > 1e-9) | (abs(nlpd) > 1e-9)
-        new_warning = [(w != b) and bool(w) for w, b in zip(own.warning, base_line.warning, strict=True)]
+        new_warning = own.warning != base_line.warning
         failed = (own.failure != "") & (base_line.failure == "")
 
         def shown(values: pd.Series, form: str) -> str:
