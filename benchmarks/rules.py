@@ -891,9 +891,10 @@ def sixty_features(seed: int) -> tuple[np.ndarray, ...]:
 def missed_column(seed: int) -> tuple[np.ndarray, ...]:
     """A column that looks like noise on a sample."""
     rng = np.random.default_rng(1 + seed)
-    X = rng.uniform(-1.0, 1.0, (5000, 6))
+    X = rng.uniform(-1.0, 1.0, (6000, 6))
     signal = 2.0 * X[:, 1] + X[:, 2] ** 2 + 0.8 * np.sin(5.0 * X[:, 0])
-    return X[:4000], signal[:4000] + rng.standard_normal(4000), X[4000:], signal[4000:]
+    y = signal + rng.standard_normal(6000)
+    return X[:5000], y[:5000], X[5000:], signal[5000:]
 
 
 def parabola(seed: int) -> tuple[np.ndarray, ...]:
@@ -1026,6 +1027,10 @@ PROBLEMS = {
     "student-steep-one-side": Problem(simple(steep(2, 0.15, 1.0, True), noise="student-t"), "sparse folds robust"),
     "student-many": Problem(simple(outlying(0.35, 10.0), noise="student-t"), "sparse folds robust"),
     "student-3000": Problem(simple(outlying(0.1, 3.0, n=3000), noise="student-t"), "sparse folds robust"),
+    "student-20-iterations": Problem(
+        simple(outlying(0.1, 10.0), noise="student-t", max_iter=20), "sparse folds robust"
+    ),
+    "student-12": Problem(simple(outlying(0.17, 10.0, n=12), noise="student-t"), "robust complete"),
     "student-two": Problem(simple(two_outputs_with_outliers, noise="student-t"), "sparse folds robust"),
     "auto": Problem(simple(lambda seed: drawn(300, 2, 0.05, seed), m="auto"), "sparse folds auto"),
     "auto-fast": Problem(simple(fast_waves, m="auto"), "sparse folds auto"),
@@ -1051,6 +1056,7 @@ PROBLEMS = {
     "interpolating-1e8": Problem(interpolating(1e8, 0.01), "complete features wide"),
     "sixty-features": Problem(simple(sixty_features, features=poly(1), normalize_y=True), "complete features wide"),
     "missed-column": Problem(simple(missed_column, m=30), "sparse folds many"),
+    "missed-column-40": Problem(simple(missed_column, m=40, noise_cv=None), "sparse many"),
     "very-fast": Problem(simple(very_fast, m=60), "sparse folds many"),
     "weak-signal": Problem(simple(weak_signal, m=20), "sparse folds many"),
     "parabola": Problem(simple(parabola), "complete folds"),
@@ -1097,7 +1103,7 @@ def measured(rule: str, name: str, seed: int) -> dict[str, Any]:
             row["failure"] = f"{type(error).__name__}: {error}"[:120].replace("\n", " ")
             if not isinstance(error, (ValueError, ArithmeticError, np.linalg.LinAlgError)):
                 traceback.print_exc()
-    row["warning"] = " | ".join(sorted({str(one.message)[:50].replace("\n", " ") for one in told}))
+    row["warning"] = " | ".join(sorted({str(one.message)[:30].replace("\n", " ") for one in told}))
     return row
 
 
