@@ -932,6 +932,14 @@ def weak_signal(seed: int) -> tuple[np.ndarray, ...]:
     return X[:8000], y[:8000] + 8.0 * rng.randn(8000), X[8000:], y[8000:]
 
 
+def weaker_signal(seed: int) -> tuple[np.ndarray, ...]:
+    rng = np.random.RandomState(seed)
+    X = rng.uniform(-1.0, 1.0, (20500, 3))
+    y = np.sin(3.0 * X[:, 0]) + X[:, 1] ** 2
+    noise = 12.0 * rng.randn(20500)
+    return X[:20000], y[:20000] + noise[:20000], X[20000:], y[20000:]
+
+
 def apart(seed: int) -> tuple[np.ndarray, ...]:
     """Outputs of two kinds of kernels, of very different sizes."""
     rng = np.random.RandomState(seed)
@@ -956,6 +964,16 @@ def warm(seed: int) -> Job:
     X, y, X_new, y_new = drawn(200, 2, 0.05, seed)
     fitted = sparse_of(None, 12, seed, warm_start=True).fit(X, y)
     return Job(fitted, {"X": 1e3 * X, "y": y}, 1e3 * X_new, y_new)
+
+
+def fixed_high_signal(seed: int) -> Job:
+    """More features than rows, and a kernel with a fixed high signal."""
+    rng = np.random.RandomState(2 * seed + 1)
+    X, weights = rng.randn(112, 5), rng.randn(5)
+    y = X @ weights + 0.01 * rng.randn(112)
+    kernel = ConstantKernel(100.0, "fixed") * RBF(np.ones(5))
+    model = sparse_of(poly(2), 6, 0, kernel=kernel, coef_prior=CoefPrior(scale=1e3), normalize_y=True)
+    return Job(model, {"X": X[:12], "y": y[:12]}, X[12:], y[12:])
 
 
 def toy(seed: int) -> tuple[np.ndarray, ...]:
@@ -987,6 +1005,7 @@ PROBLEMS = {
     "few-rows-features": Problem(simple(lambda seed: drawn(25, 3, 0.1, seed), features=poly(2)), "complete features"),
     "columns-as-rows": Problem(simple(as_wide_as_long, features=poly(1)), "sparse features wide"),
     "fixed-signal": Problem(fixed_signal, "sparse features wide"),
+    "fixed-high-signal": Problem(fixed_high_signal, "sparse features wide"),
     "features-interpolate": Problem(
         simple(lambda seed: drawn(60, 2, 0.3, seed), features=poly(9), m=12), "sparse features wide folds"
     ),
@@ -1059,6 +1078,7 @@ PROBLEMS = {
     "missed-column-40": Problem(simple(missed_column, m=40, noise_cv=None), "sparse many"),
     "very-fast": Problem(simple(very_fast, m=60), "sparse folds many"),
     "weak-signal": Problem(simple(weak_signal, m=20), "sparse folds many"),
+    "weaker-signal": Problem(simple(weaker_signal, noise_cv=None), "sparse many"),
     "parabola": Problem(simple(parabola), "complete folds"),
     "parabola-30": Problem(simple(parabola, m=30), "sparse folds"),
     "phases": Problem(simple(phases, m=60), "sparse groups"),
