@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -55,13 +54,10 @@ class FittedModel:
         """Upper bound on the same. None is known for noise with heavy tails."""
         return self.posterior.upper_bound if self.doubts is None else np.inf
 
-    @cached_property
+    @property
     def predictor(self) -> Predictor:
         """The predictor of residuals, with the noise variance of rows that are not outliers."""
-        predictor = self.posterior.predictor
-        if self.doubts is None:
-            return predictor
-        return replace(predictor, noise=self.values["noise"] * self.doubts.noise_factor)
+        return self.posterior.predictor
 
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
         """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.

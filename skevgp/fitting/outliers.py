@@ -58,7 +58,7 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
     # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
     weighed = replace(weighed, rows=doubts.weigh(rows))
     if len(rows) >= _FEWEST_ROWS:
-        look, std = look_at(rows, predictor_at(weighed, fit.values)), np.sqrt(fit.values["noise"] * doubts.noise_factor)
+        look, std = look_at(rows, predictor_at(weighed, fit.values)), np.sqrt(fit.values["noise"])
         doubts = replace(doubts, far=float(look.far_from_median(FAR, _SHARE_OF_NOISE * std).mean()))
     return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
 
@@ -123,8 +123,8 @@ def _first_of(look: Look, scales: RowScales, typical: np.ndarray | None = None) 
     distances = look.distances(typical)
     far = (scales.at(distances).outlier > 0.5) | look.beyond(typical)
     if far.mean() > FEW:
-        return RowDoubts(scales.at(np.zeros(len(far))), np.ones(len(typical)))
-    return RowDoubts(scales.at(distances), np.ones(len(typical)), far if far.any() else None)
+        return RowDoubts(scales.at(np.zeros(len(far))))
+    return RowDoubts(scales.at(distances), far if far.any() else None)
 
 
 def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model, Fit, RowDoubts]:
@@ -136,7 +136,7 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
     noise = fit.values["noise"]
     for _ in range(TURNS):
         look = look_at(rows, predictor_at(model, fit.values), doubts.precision(model.sparse, noise))
-        before, doubts = doubts, doubts.seen_in(look, noise, model.table["noise"].free)
+        before, doubts = doubts, doubts.seen_in(look, noise)
         model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break
