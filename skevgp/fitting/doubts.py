@@ -34,8 +34,6 @@ class RowDoubts:
 
     # q(τ) of each row.
     scales: RowScales
-    # (o,): the noise variance of rows that are not outliers, in units of σ².
-    noise_factor: np.ndarray
     # (n,): rows with errors that are too large for the noise, whatever its model. None: no row.
     rejected: np.ndarray | None = None
     # Share of the rows with errors far from the median error.
@@ -45,12 +43,11 @@ class RowDoubts:
         # Copies and pickles of a model hold no rows.
         return {**vars(self), "rejected": None}
 
-    def seen_in(self, look: Look, noise: np.ndarray, free: np.ndarray) -> RowDoubts:
-        """The doubts for other errors, with noise variances (o,), of which some may be ``free`` (o,)."""
+    def seen_in(self, look: Look, noise: np.ndarray) -> RowDoubts:
+        """The doubts for other errors, with noise variances (o,)."""
         scales = self.scales.at(look.distances(noise))
-        rejected = (scales.outlier > 0.5) | look.beyond(noise * self.noise_factor)
-        factor = np.where(free, look.clean_variance(rejected) / noise, 1.0)
-        return RowDoubts(scales, factor, rejected if 0.0 < rejected.mean() <= FEW else None)
+        rejected = (scales.outlier > 0.5) | look.beyond(noise)
+        return RowDoubts(scales, rejected if 0.0 < rejected.mean() <= FEW else None)
 
     def weigh(self, rows: Rows) -> Rows:
         """The rows weighted by their noise scales."""
@@ -133,14 +130,6 @@ class Look:
     def distances(self, noise: np.ndarray) -> np.ndarray:
         """The squared Mahalanobis distance (n,) of rows, for noise variances (o,)."""
         return (self.squares / noise).sum(axis=1)
-
-    def clean_variance(self, rejected: np.ndarray) -> np.ndarray:
-        """Mean squared errors (o,) of the rows that are not rejected."""
-        kept = ~rejected
-        if not kept.any():
-            return self.typical
-        squares = self.counts[kept] @ self.squares[kept] / self.counts[kept].sum()
-        return np.maximum(squares, np.finfo(float).tiny)
 
 
 def look_at(rows: Rows, predictor: Predictor, precision: np.ndarray | None = None) -> Look:

@@ -59,10 +59,7 @@ class FittedModel:
     @property
     def predictor(self) -> Predictor:
         """The predictor of residuals, with the noise variance of rows that are not outliers."""
-        predictor = self.posterior.predictor
-        if self.doubts is None:
-            return predictor
-        return replace(predictor, noise=self.values["noise"] * self.doubts.noise_factor)
+        return self.posterior.predictor
 
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
         """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.

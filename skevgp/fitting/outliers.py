@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import t as student_t
 
 from ..data.rows import RawRows, Rows
 from ..model.parameters import Values
@@ -28,8 +27,6 @@ _LOOKS = 5
 _PATIENCE = 3.0
 # In the first short fit, which outliers may pull, rows count as outliers from so many standard deviations.
 _FAR_FROM_MEDIAN = 3.0
-# Outliers follow a Student-t with so many degrees of freedom, that is so many times as wide as the noise.
-_OUTLIER_DEGREES, _OUTLIER_WIDTH = 4.0, 30.0
 # Of 15 % of outliers at random places, 3 % are next to each other. A larger share than this is no chance.
 _TOGETHER = 0.2
 # Where most errors are almost 0, as of classes, the scale of errors is not below this share of the noise.
@@ -61,16 +58,15 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
     # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
     weighed = replace(weighed, rows=doubts.weigh(rows))
     if len(rows) >= _FEWEST_ROWS:
-        look, std = look_at(rows, predictor_at(weighed, fit.values)), np.sqrt(fit.values["noise"] * doubts.noise_factor)
+        look, std = look_at(rows, predictor_at(weighed, fit.values)), np.sqrt(fit.values["noise"])
         doubts = replace(doubts, far=float(look.far_from_median(FAR, _SHARE_OF_NOISE * std).mean()))
     return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
 
 
 def _first_doubts(model: Model) -> RowDoubts:
-    """Noise scales from short fits to some rows: with outliers from medians, or without any, whichever is likelier."""
-    # Medians of neighbours are also wrong where a function is steep, or where few rows see it. So a fit to all rows,
-    # whose outliers are those that it shows by itself, is tried too. It is kept if the outliers of the medians are next
-    # to each other, as the rows of a bump are.
+    """Noise scales from short fits to some rows. Their outliers begin with those of the medians of neighbours."""
+    # Medians of neighbours are wrong where a function is steep, or where few rows see it. Their outliers may then be
+    # next to each other, as the rows of a bump are. In this case the outliers are those of a fit to all rows.
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
     chosen = np.arange(len(rows))
     if size < len(rows):
@@ -78,34 +74,15 @@ def _first_doubts(model: Model) -> RowDoubts:
     short = replace(model, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
     raw = rows.some(np.arange(len(rows)))
     neighbours = Neighbours.of(raw.inputs)
-    robust, from_robust = _robust_doubts(short, rows, chosen, _doubts_of_medians(short, raw, neighbours))
-    if robust.rejected is None:
+    robust = _robust_doubts(short, rows, chosen, _doubts_of_medians(short, raw, neighbours))
+    if robust.rejected is None or neighbours.together(robust.rejected) <= _TOGETHER:
         return robust
     every = replace(short, rows=rows.subset(chosen))
-    from_plain = search(every).values
-    plain = _first_of(look_at(rows, predictor_at(every, from_plain)), robust.scales)
-    if neighbours.together(robust.rejected) > _TOGETHER:
-        return plain
-    evidence_of_robust = _evidence(short, rows, chosen, robust, from_robust)
-    evidence_of_plain = _evidence(short, rows, chosen, plain, from_plain)
-    return robust if evidence_of_robust > evidence_of_plain else plain
+    return _first_of(look_at(rows, predictor_at(every, search(every).values)), robust.scales)
 
 
-def _evidence(model: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts, values: Values) -> float:
-    """The bound of chosen rows that are not rejected, plus the log density of the others as outliers, in nats."""
-    others = replace(model, rows=doubts.without_outliers(doubts.weigh(rows)).subset(chosen))
-    fit = others.minimise(Start(values, model.max_iter))
-    if doubts.rejected is None or not (rejected := doubts.rejected[chosen]).any():
-        return fit.bound
-    look = look_at(rows.subset(chosen), predictor_at(others, fit.values))
-    share, scale = rejected.mean(), _OUTLIER_WIDTH * np.sqrt(fit.values["noise"])
-    wide = student_t.logpdf(np.sqrt(look.squares[rejected]) / scale, _OUTLIER_DEGREES) - np.log(scale)
-    n_others = len(chosen) - rejected.sum()
-    return float(fit.bound + n_others * np.log1p(-share) + rejected.sum() * np.log(share) + wide.sum())
-
-
-def _robust_doubts(short: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts) -> tuple[RowDoubts, Values]:
-    """Noise scales that begin with those of the medians of neighbours, and the values of the last short fit."""
+def _robust_doubts(short: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoubts) -> RowDoubts:
+    """Noise scales that begin with those of the medians of neighbours."""
     # Many outliers on one side pull a fit towards them, so that it does not show them. Medians of neighbours are not
     # pulled. Without the outliers that they show, a fit shows others (as the C-steps of Rousseeuw & Van Driessen 1999).
     seen = doubts.without_outliers(doubts.weigh(rows))
@@ -123,8 +100,7 @@ def _robust_doubts(short: Model, rows: Rows, chosen: np.ndarray, doubts: RowDoub
             seen = doubts.without_outliers(doubts.weigh(rows))
             if doubts.rejects_as(before):
                 break
-    assert values is not None
-    return doubts, values
+    return doubts
 
 
 def _doubts_of_medians(model: Model, raw: RawRows, neighbours: Neighbours) -> RowDoubts:
@@ -147,8 +123,8 @@ def _first_of(look: Look, scales: RowScales, typical: np.ndarray | None = None) 
     distances = look.distances(typical)
     far = (scales.at(distances).outlier > 0.5) | look.beyond(typical)
     if far.mean() > FEW:
-        return RowDoubts(scales.at(np.zeros(len(far))), np.ones(len(typical)))
-    return RowDoubts(scales.at(distances), np.ones(len(typical)), far if far.any() else None)
+        return RowDoubts(scales.at(np.zeros(len(far))))
+    return RowDoubts(scales.at(distances), far if far.any() else None)
 
 
 def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model, Fit, RowDoubts]:
@@ -160,7 +136,7 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
     noise = fit.values["noise"]
     for _ in range(TURNS):
         look = look_at(rows, predictor_at(model, fit.values), doubts.precision(model.sparse, noise))
-        before, doubts = doubts, doubts.seen_in(look, noise, model.table["noise"].free)
+        before, doubts = doubts, doubts.seen_in(look, noise)
         model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break

@@ -26,9 +26,6 @@ from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect, errors
 from .weights import WeightLikelihood, weight_likelihoods
 
-# Means are refined only if the rounding error of B, in directions in which B is about 1, is below this.
-_REFINABLE = 0.1
-
 
 @dataclass(frozen=True)
 class SparseModel:
@@ -214,13 +211,10 @@ class SparseModel:
 def _refined(group: Group, posteriors: list[WhitenedPosterior], blocks: Blocks) -> list[WhitenedPosterior]:
     """Posteriors with means after one step of iterative refinement: a pass over the rows."""
     # Where the data say little about ω, B is about 1, and its rounding errors are a share of its trace. There the
-    # solution of B mean = g loses digits. ρ = g - B mean, from residuals summed row by row, does not. If errors of B
-    # are above `_REFINABLE`, a step need not lead closer.
+    # solution of B mean = g loses digits. ρ = g - B mean, from residuals summed row by row, does not.
     weights = np.column_stack([group.times_T(o, q.mean) for o, q in enumerate(posteriors)])
     residuals = errors(blocks, group.whitening, group.outputs, weights)
     refined = []
     for q, error in zip(posteriors, equation_errors(group, posteriors, residuals), strict=True):
-        step = q.root_inv.T @ (q.root_inv @ error)
-        refinable = np.finfo(float).eps * np.trace(q.B) < _REFINABLE
-        refined.append(replace(q, mean=q.mean + step) if refinable else q)
+        refined.append(replace(q, mean=q.mean + q.root_inv.T @ (q.root_inv @ error)))
     return refined
