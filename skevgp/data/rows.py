@@ -195,9 +195,9 @@ class LocalSource:
         """The same rows, with ω multiplied by factors (n_rows,), and with log_variance (n_rows,) added to log v."""
         return LocalSource(partial(_reweighted, self.take, factors, log_variance), self.n_rows, self.positions)
 
-    def repeated(self, times: np.ndarray) -> LocalSource:
-        """The same rows with weights w multiplied by ``times`` (n_rows,)."""
-        return LocalSource(partial(_repeated, self.take, times), self.n_rows, self.positions)
+    def counted(self, factors: np.ndarray) -> LocalSource:
+        """The same rows, each of which counts ``factors`` (n_rows,) times as much: w and ω are multiplied by them."""
+        return LocalSource(partial(_counted, self.take, factors), self.n_rows, self.positions)
 
     def with_targets(self, targets: np.ndarray) -> LocalSource:
         """The same rows with other targets (n_rows, o)."""
@@ -224,11 +224,11 @@ def _some(take: Callable[[np.ndarray], RawRows], chosen: np.ndarray, rows: slice
     return take(chosen[rows])
 
 
-def _repeated(take: Callable[[slice | np.ndarray], RawRows], times: np.ndarray, rows: slice | np.ndarray) -> RawRows:
-    raw, times = take(rows), times[rows]
+def _counted(take: Callable[[slice | np.ndarray], RawRows], factors: np.ndarray, rows: slice | np.ndarray) -> RawRows:
+    raw, factors = take(rows), factors[rows]
     if raw.counts is None or raw.precision is None:
-        return replace(raw, counts=times, precision=times)
-    return replace(raw, counts=raw.counts * times, precision=raw.precision * times)
+        return replace(raw, counts=factors, precision=factors)
+    return replace(raw, counts=raw.counts * factors, precision=raw.precision * factors)
 
 
 def _with_targets(

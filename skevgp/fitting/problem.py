@@ -25,7 +25,7 @@ from .inducing import Placement
 from .prior import CoefPrior, InData, coef_names, resolved, says_shared, wide_scale
 from .robust import without_far_targets
 from .rules import Rules, rules_of
-from .units import LeftOver, Units, triangles_of_features
+from .units import LeastSquares, Units
 
 # An infinite prior scale becomes this many times the scale of weights without prior knowledge.
 _VAGUE = 10.0
@@ -123,8 +123,9 @@ class Problem:
                 )
             spec = spec.with_noise(noise.variance)
         target_mean = targets.mean if normalize_y else np.zeros(len(targets.mean))
-        prior, vague = _prior(coef_prior, data, features, targets, target_mean, allow_vague)
-        units = Units.of(data.source, features, targets, target_mean, prior)
+        rows = LeastSquares.of(data.source, target_mean)
+        prior, vague = _prior(coef_prior, data, features, targets, rows, allow_vague)
+        units = Units.of(data.source, features, targets, rows, prior)
         with np.errstate(over="ignore"):
             spread = prior.scale * features.largest / units.target_unit[:, np.newaxis]
         check_magnitude(
@@ -140,7 +141,8 @@ class Problem:
     def with_features(self, data: Dataset, prior: CoefficientPrior) -> Problem:
         """The same problem with other features of the same rows. ``prior`` is that of their weights."""
         inputs, features, targets = data.source.sum(moments_of_rows)
-        units = Units.of(data.source, features, targets, self.units.target_mean, prior)
+        rows = LeastSquares.of(data.source, self.units.target_mean)
+        units = Units.of(data.source, features, targets, rows, prior)
         vague = np.zeros(prior.scale.shape, dtype=bool)
         vague[:, : self.vague.shape[1]] = self.vague
         shapes = inputs.mean.shape, features.mean.shape
@@ -199,7 +201,7 @@ class Problem:
 
 
 def _prior(
-    asked: CoefPrior, data: Dataset, features: Moments, targets: Moments, target_mean: np.ndarray, allow_vague: bool
+    asked: CoefPrior, data: Dataset, features: Moments, targets: Moments, rows: LeastSquares, allow_vague: bool
 ) -> tuple[CoefficientPrior, np.ndarray]:
     """The prior of the weights in the user's units, and which of them (o, p) are vague."""
     o, shared, feature_map = len(targets.mean), asked.shared, data.maps.feature_map
@@ -213,7 +215,7 @@ def _prior(
     size = np.where(counts, features.rms, 0.0)
 
     def left_over(mean: np.ndarray) -> np.ndarray:
-        _, squares = data.source.sum(LeftOver(target_mean, np.broadcast_to(mean, (o, mean.shape[1]))))
+        squares = np.sum(rows.left_over(np.broadcast_to(mean, (o, mean.shape[1]))) ** 2, axis=1)
         found = np.sqrt(squares / targets.n)
         return np.where(found > 0.0, found, np.where(targets.largest > 0.0, targets.largest, 1.0))
 
@@ -221,13 +223,12 @@ def _prior(
 
     @cache
     def wide(learned: bool) -> np.ndarray:
-        R, total_precision = triangles_of_features(data.source)
-        R = R * counts.reshape(-1, 1, counts.shape[-1])
+        R = rows.features * counts.reshape(-1, 1, counts.shape[-1])
         if moderate := learned or few:
-            y = np.sqrt(targets.variance + (targets.mean - target_mean) ** 2)
+            y = np.sqrt(targets.variance + (targets.mean - rows.target_mean) ** 2)
         else:
-            y = np.maximum(np.abs(targets.lowest - target_mean), np.abs(targets.highest - target_mean))
-        return wide_scale(R, total_precision, y, shared, moderate)
+            y = np.maximum(np.abs(targets.lowest - rows.target_mean), np.abs(targets.highest - rows.target_mean))
+        return wide_scale(R, targets.n, y, shared, moderate)
 
     shape = 1 if shared else o, features.mean.shape[-1]
     found = resolved(asked, feature_map, data.given, InData(shape, wide, size, left_over), o, allow_vague)

@@ -4,174 +4,169 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
-from scipy.linalg import svd
+from scipy.linalg import lapack, lstsq, qr
 
 from ..data.rows import SMALLEST_UNIT, Columns, Moments, RawRows, Rows, Source, times_weights
 from ..data.threads import BlockMap
 from ..model.predictor import CoefficientPrior, Predictor
-from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse
 
 # Size of the rounding errors of residuals, as a share of the target's largest value.
 _TARGET_ROUNDING = 1e-14
-# If a smaller share of a feature is independent of the others, sums of products keep few of its digits.
-_SEEN = 1e-6
-# With a smaller share than this, refinement would not converge.
+# Directions in which features of length 1 vary less than this are rounding errors.
 _ROUNDING = 1e-12
+# If the features explain all but this share of Σ ω (y - target_mean)², the residuals are fitted once more.
+_NEARLY_EXACT = 1e-12
+# The least noise variance of an output that shares its weights, as a share of the largest one.
+_LEAST_NOISE = 1e-16
+# Number of columns that LAPACK reflects together.
+_PANEL = 32
 
 
-def _products(raw: RawRows, basis: np.ndarray | None = None) -> np.ndarray:
-    """HᵀΩH of features times the basis (k, p, p): (p, p), or (o, p, p) if each output has its own features."""
-    H = raw.features if raw.features.ndim == 2 else raw.features.transpose(1, 0, 2)
-    if basis is not None:
-        H = H @ (basis[0] if H.ndim == 2 else basis)
-    HW = np.swapaxes(H, -1, -2)
-    HW = HW if raw.precision is None else HW * raw.precision
-    return HW @ H
+def _residuals(raw: RawRows, target_mean: np.ndarray, coef: np.ndarray | None) -> np.ndarray:
+    """Residuals y - target_mean - H coefᵀ (n, o). None: the weights are 0."""
+    left_over = raw.targets - target_mean
+    return left_over if coef is None else left_over - times_weights(raw.features, coef)
 
 
-@dataclass(frozen=True)
-class LeftOver:
-    """Maps rows to HᵀΩl (o, p) and lᵀΩl (o,), with l = y - target_mean - H coefᵀ. Optionally also HᵀΩH, Σω, Σw."""
-
-    target_mean: np.ndarray
-    coef: np.ndarray
-    with_products: bool = False
-
-    def __call__(self, raw: RawRows) -> tuple[Any, ...]:
-        H = raw.features
-        left_over = raw.targets - self.target_mean - times_weights(H, self.coef)
-        weighted, precision = left_over, raw.total
-        if raw.precision is not None:
-            weighted, precision = left_over * raw.precision[:, np.newaxis], float(raw.precision.sum())
-        HL = weighted.T @ H if H.ndim == 2 else np.einsum("no,nop->op", weighted, H)
-        sums = HL, np.einsum("no,no->o", weighted, left_over)
-        return (*sums, _products(raw), precision, raw.total) if self.with_products else sums
+def _squares(raw: RawRows, target_mean: np.ndarray, coef: np.ndarray) -> np.ndarray:
+    """Σω of the squared residuals, (o,)."""
+    squares = _residuals(raw, target_mean, coef) ** 2
+    total: np.ndarray = squares.sum(axis=0) if raw.precision is None else raw.precision @ squares
+    return total
 
 
 @dataclass(frozen=True)
-class _ProductsIn:
-    """Maps rows to (HᵀΩH in a basis,)."""
+class LeastSquares:
+    """A few rows [A, b] that replace all rows [H, y - target_mean] in least squares.
 
-    basis: np.ndarray
-
-    def __call__(self, raw: RawRows) -> tuple[np.ndarray]:
-        return (_products(raw, self.basis),)
-
-
-def _feature_products(raw: RawRows) -> tuple[np.ndarray, float]:
-    """HᵀΩH and Σω."""
-    return _products(raw), raw.total if raw.precision is None else float(raw.precision.sum())
-
-
-def triangles_of_features(source: Source) -> tuple[np.ndarray, float]:
-    """Upper triangular R (k, p, p) with RᵀR = HᵀΩH (see `_triangles`), and Σω."""
-    HH, total_precision = source.sum(_feature_products)
-    return _triangles(source, HH), total_precision
-
-
-def _triangles(source: Source, HH: np.ndarray) -> np.ndarray:
-    """Upper triangular R (k, p, p) with RᵀR = HᵀΩH. k is the number of outputs if each has its own features, else 1."""
-    # Features may be nearly collinear, as powers of a column far from 0. Then the products are summed again in the
-    # basis R⁻¹. Their own R restores the digits that the first one lacks (shifted Cholesky QR; Fukaya, Kannan,
-    # Nakatsukasa, Yamamoto & Yanagisawa 2020). Their third factor makes Q orthogonal to the last digit. Q is not used
-    # here.
-    R, lower, sizes = _triangles_of(HH)
-    if all((diagonal_of(L) >= _SEEN).all() for L in lower):
-        return R
-    basis = np.array([triangular_inverse(L).T for L in lower])
-    (again,) = source.sum(_ProductsIn(basis / np.where(sizes > 0.0, sizes, 1.0)[:, :, np.newaxis]))
-    return _triangles_of(again)[0] @ R
-
-
-def _triangles_of(products: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """Upper factors (k, p, p) of HᵀΩH, lower factors for columns of length 1, and the lengths (k, p) of the columns."""
-    products = products if products.ndim == 3 else products[np.newaxis]
-    sizes = np.sqrt(np.einsum("kii->ki", products))
-    by = np.where(sizes > 0.0, sizes, 1.0)
-    lower = []
-    for each in products / (by[:, :, np.newaxis] * by[:, np.newaxis]):
-        diagonal_of(each)[...] = 1.0
-        lower.append(jittered_cholesky(each))
-    return np.array([L.T for L in lower]) * sizes[:, np.newaxis], lower, sizes
-
-
-def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
-    """The posterior mode w (o, p) of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), and the residuals' rms (o,).
-
-    The rms weighs rows by ω.
+    For any weights β, |b - A β|² is the sum of squared residuals, weighted by ω.
     """
-    # The noise variance is first negligible, then the mean squared residual of that fit. Two steps of iterative
-    # refinement correct the rounding of sums over targets.
-    (o, p), roots = prior.scale.shape, prior.roots()
-    w = np.zeros((o, p))
-    HL, squares, HH, total_precision, n_rows = source.sum(LeftOver(target_mean, prior.mean, with_products=True))
-    everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
-    together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
-    if not together:
-        return w, np.sqrt(squares / total_precision)
-    triangles = _triangles(source, HH) @ roots
-    # If outputs share their weights, the residuals of each decide how much it counts.
-    for share in (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0):
-        noise = share * squares / n_rows
-        steps = [_Step.of(outputs, noise[outputs], triangles) for outputs in together if noise[outputs].any()]
-        for _ in range(3):
-            for step in steps:
-                step.take(w, np.einsum("oij,oi->oj", roots, HL))
-            HL, squares = source.sum(LeftOver(target_mean, prior.mean + prior.times(w)))
-    return w, np.sqrt(squares / total_precision)
 
+    # [A, b] is a rotation of the triangle R of √Ω [H, y - target_mean] = Q R (Golub & Van Loan 2013, section 5.3). The
+    # triangle of two parts of the rows is that of their triangles, one below the other. Hence one pass is enough (TSQR;
+    # Demmel, Grigori, Hoemmen & Langou 2012). The rounding errors of a column are small next to this column (Higham
+    # 2002, theorem 19.4). Products HᵀΩH would lose twice as many digits of nearly collinear features (Björck 1996,
+    # section 2.2).
 
-@dataclass(frozen=True)
-class _Step:
-    """A Newton step of the w that some outputs share, for fixed noise variances, in units of the smallest one."""
-
-    outputs: list[int]
-    # The smallest noise variance, and its ratio (k,) to that of each output.
-    least: float
-    counts: np.ndarray
-    # (p, k): a B with B Bᵀ the inverse of the precision of w, without directions that are lost in rounding.
-    root: np.ndarray
-    # (p, p): for nearly collinear features, removes rounding errors from Cᵀ Hᵀ l: its part in directions in which the
-    # features do not vary, where the prior decides.
-    told: np.ndarray | None = None
+    # (k, r, p + q): k triangles of p features and q targets. If each output has its own features, k = o and q = 1, else
+    # k = 1 and q = o. r is p + q, or the number of rows if that is smaller.
+    triangles: np.ndarray
+    # (o,): subtracted from y.
+    target_mean: np.ndarray
+    # p.
+    n_features: int
 
     @classmethod
-    def of(cls, outputs: list[int], noise: np.ndarray, triangles: np.ndarray) -> _Step:
-        """Prepare the step from R C (o, p, p) of all outputs and their noise variances."""
-        # The precision itself is not formed: that would square its condition number.
-        noise = np.maximum(noise, 1e-16 * noise.max())
-        least = float(noise.min())
-        counts, p = least / noise, triangles.shape[-1]
-        rows = (np.sqrt(counts)[:, np.newaxis, np.newaxis] * triangles[outputs]).reshape(-1, p)
-        upper = np.linalg.qr(np.concatenate([rows, np.sqrt(least) * np.eye(p)])).R
-        sizes = np.abs(upper).max(axis=0)
-        if (np.abs(diagonal_of(upper)) >= _SEEN * sizes).all():
-            return cls(outputs, least, counts, triangular_inverse(upper.T).T)
-        values, vectors = _varying(upper / sizes)
-        root = (vectors / values[:, np.newaxis] / sizes).T
-        _, vectors = _varying(rows / sizes)
-        return cls(outputs, least, counts, root, (vectors * sizes).T @ (vectors / sizes))
+    def of(cls, source: Source, target_mean: np.ndarray, coef: np.ndarray | None = None) -> LeastSquares:
+        """Read all rows once. With weights ``coef`` (o, p), their residuals replace the targets."""
+        total = source.sum(partial(cls._of_rows, target_mean=target_mean, coef=coef))
+        rotated = [_without_rounding(rows, total.n_features) for rows in total.triangles]
+        return replace(total, triangles=np.array(rotated))
 
-    def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
-        """Move w (o, p) in place, given Cᵀ Hᵀ l (o, p) of its residuals l."""
-        wanted = self.counts @ from_data[self.outputs]
-        wanted = wanted if self.told is None else self.told @ wanted
-        wanted -= self.least * w[self.outputs[0]]
-        w[self.outputs] += self.root @ (self.root.T @ wanted)
+    @classmethod
+    def _of_rows(cls, raw: RawRows, target_mean: np.ndarray, coef: np.ndarray | None) -> LeastSquares:
+        H, targets = raw.features, _residuals(raw, target_mean, coef).T
+        parts = [(H, targets)]
+        if H.ndim == 3:
+            parts = [(H[:, output], targets[[output]]) for output in range(len(targets))]
+        root = 1.0 if raw.precision is None else np.sqrt(raw.precision)
+        triangles = [_triangle((np.concatenate([features.T, some]) * root).T) for features, some in parts]
+        return cls(np.array(triangles), target_mean, H.shape[-1])
+
+    def __add__(self, other: LeastSquares) -> LeastSquares:
+        both = np.concatenate([self.triangles, other.triangles], axis=1)
+        return replace(self, triangles=np.array([_triangle(rows) for rows in both]))
+
+    @property
+    def features(self) -> np.ndarray:
+        """A, (k, r, p)."""
+        return self.triangles[:, :, : self.n_features]
+
+    @property
+    def targets(self) -> np.ndarray:
+        """b, (o, r)."""
+        columns = self.triangles[:, :, self.n_features :].swapaxes(1, 2)
+        return columns.reshape(-1, columns.shape[2])
+
+    def left_over(self, coef: np.ndarray) -> np.ndarray:
+        """Residuals b - A β (o, r) for weights β (o, p)."""
+        return self.targets - np.squeeze(self.features @ coef[:, :, np.newaxis], axis=2)
 
 
-def _varying(upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values (k,) above rounding errors, and their right vectors (k, p)."""
-    try:
-        _, values, vectors = svd(upper, full_matrices=False)
-    except np.linalg.LinAlgError:
-        # The faster divide-and-conquer method does not always converge.
-        _, values, vectors = svd(upper, full_matrices=False, lapack_driver="gesvd")
-    kept = values >= _ROUNDING * values[0]
-    return values[kept], vectors[kept]
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    """R (r, c) of the QR decomposition of rows (n, c), with r = min(n, c)."""
+    # For tall matrices, LAPACK's dgeqrt is three times as fast as the dgeqrf of `np.linalg.qr`.
+    r = min(rows.shape)
+    return np.triu(lapack.dgeqrt(min(r, _PANEL), rows, overwrite_a=1)[0][:r])
+
+
+def _without_rounding(rows: np.ndarray, p: int) -> np.ndarray:
+    """Rotated rows (r, c) whose first p columns do not vary in directions in which they did by rounding errors only."""
+    # A QR decomposition with column pivoting shows the rank (Golub & Van Loan 2013, section 5.4). In a direction
+    # without features, Q is arbitrary, and b is not small: a rounding error in A would give this direction a weight.
+    if p == 0:
+        return rows
+    sizes = _sizes(rows[:, :p])
+    Q, R, order = qr(rows[:, :p] / sizes, pivoting=True, check_finite=False)
+    diagonal = np.abs(np.diagonal(R))
+    R[np.count_nonzero(diagonal > _ROUNDING * diagonal.max(initial=0.0)) :] = 0.0
+    rotated = np.empty(rows.shape)
+    rotated[:, order], rotated[:, p:] = R * sizes[order], Q.T @ rows[:, p:]
+    return rotated
+
+
+def _sizes(rows: np.ndarray) -> np.ndarray:
+    """The largest absolute value (c,) of each column of (r, c). 1 for a column of zeros."""
+    largest = np.abs(rows).max(axis=0, initial=0.0)
+    return np.where(largest > 0.0, largest, 1.0)
+
+
+def features_alone(
+    source: Source, rows: LeastSquares, prior: CoefficientPrior, n_rows: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The posterior mode w (o, p) of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), and its squared residuals (o,).
+
+    ``rows`` replace those of the source, which weigh ``n_rows`` in all.
+    """
+    features, w, o = rows.features @ prior.roots(), np.zeros(prior.scale.shape), len(prior.scale)
+
+    def move(left_over: np.ndarray, noise: np.ndarray) -> None:
+        for outputs in [list(range(o))] if prior.shared else [[output] for output in range(o)]:
+            if noise[outputs].any() and prior.scale[outputs].any():
+                w[outputs] += _step(features[outputs], left_over[outputs], noise[outputs], w[outputs[0]])
+
+    def squares() -> np.ndarray:
+        return source.sum(partial(_squares, target_mean=rows.target_mean, coef=prior.mean + prior.times(w)))
+
+    # The noise variance is first negligible, then the mean squared residual of that fit. If outputs share their
+    # weights, the residuals of each decide how much it counts.
+    for share in (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0):
+        left_over = rows.left_over(prior.mean + prior.times(w))
+        move(left_over, share * np.sum(left_over**2, axis=1) / n_rows)
+    remaining = squares()
+    # Rounding errors of b are small next to y, but not next to such residuals. A step of iterative refinement removes
+    # them (Björck 1996, section 2.9).
+    if (remaining < _NEARLY_EXACT * np.sum(rows.targets**2, axis=1)).any():
+        move(LeastSquares.of(source, rows.target_mean, prior.mean + prior.times(w)).targets, remaining / n_rows)
+        remaining = squares()
+    return w, remaining
+
+
+def _step(features: np.ndarray, left_over: np.ndarray, noise: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """The d (p,) that minimises |w + d|² + Σ |l - A d|² / σ² over outputs with A (g, r, p), l (g, r) and σ² (g,)."""
+    # In units of the smallest σ², this is least squares with the rows of the prior below those of the data (Björck
+    # 1996, section 2.7). If neither is above the rounding errors of the other in a direction, the shortest d keeps the
+    # w of the noise before.
+    noise = np.maximum(noise, _LEAST_NOISE * noise.max())
+    least, p = noise.min(), len(w)
+    roots = np.sqrt(least / noise)[:, np.newaxis]
+    rows = np.concatenate([(roots[:, :, np.newaxis] * features).reshape(-1, p), np.sqrt(least) * np.eye(p)])
+    wanted, sizes = np.append(roots * left_over, -np.sqrt(least) * w), _sizes(rows)
+    step: np.ndarray = lstsq(rows / sizes, wanted, cond=_ROUNDING, lapack_driver="gelsy", check_finite=False)[0]
+    return step / sizes
 
 
 def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:
@@ -265,17 +260,16 @@ class Units:
         source: Source,
         features: Moments,
         targets: Moments,
-        target_mean: np.ndarray,
+        rows: LeastSquares,
         prior: CoefficientPrior,
     ) -> Units:
         """The units of training rows, given the moments of their features and targets, and the prior of the weights."""
-        reference, left_over = features_alone(source, target_mean, prior)
+        reference, squares = features_alone(source, rows, prior, features.n)
         largest = np.max(np.abs(prior.mean) * features.largest, axis=1, initial=0.0)
-        unit, constant = unit_of(left_over, targets, largest)
+        unit, constant = unit_of(np.sqrt(squares / targets.n), targets, largest)
         rounding = (np.finfo(float).eps * targets.largest / unit) ** 2
-        return cls(
-            target_mean, unit, replace(prior, reference=reference), targets.variance / unit**2, rounding, constant
-        )
+        prior = replace(prior, reference=reference)
+        return cls(rows.target_mean, unit, prior, targets.variance / unit**2, rounding, constant)
 
     def to_internal(self, raw: RawRows) -> RawRows:
         """The same inputs and features, with the residuals in internal units for targets."""

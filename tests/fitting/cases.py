@@ -8,7 +8,7 @@ from skevgp.fitting.fit import fit_model
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.parts import models_of
 from skevgp.fitting.problem import Problem
-from skevgp.fitting.units import Units
+from skevgp.fitting.units import LeastSquares, Units
 from skevgp.kernels.parse import parse_kernel
 from skevgp.model.predictor import CoefficientPrior
 from skevgp.utils.monitor import Monitor
@@ -32,7 +32,9 @@ def units_of(X=X, H=H, Y=Y, target_mean=0.0):
     o, p = Y.shape[1], H.shape[1]
     mean, scale = (own[np.arange(o) % 2, :p] for own in (COEF_MEAN, COEF_SCALE))
     prior = CoefficientPrior(mean, scale, np.zeros((o, p)))
-    return Units.of(source_of(X, H, Y), Moments.of(H), Moments.of(Y), np.broadcast_to(target_mean, o), prior)
+    source = source_of(X, H, Y)
+    rows = LeastSquares.of(source, np.broadcast_to(target_mean, o))
+    return Units.of(source, Moments.of(H), Moments.of(Y), rows, prior)
 
 
 def data_of(Y, X=X):

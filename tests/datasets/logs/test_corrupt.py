@@ -5,22 +5,12 @@ import warnings
 import numpy as np
 import pytest
 
-from skevgp.datasets import load_log, log_transitions
+from skevgp.datasets import log_transitions
 from skevgp.exceptions import RobotModelWarning
 
 from .cases import PENDULUM, identified, pendulum
 
-COLUMNS = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
 VELOCITY, EFFORT = 2, 3
-
-
-@pytest.fixture
-def load(tmp_path):
-    def load(rows, **arguments):
-        np.savetxt(tmp_path / "log.csv", rows, delimiter=",", fmt="%.17g")
-        return load_log(tmp_path / "log.csv", **{"columns": COLUMNS, **arguments})
-
-    return load
 
 
 def spoilt(rows, column, value):

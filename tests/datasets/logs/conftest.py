@@ -1,0 +1,17 @@
+import numpy as np
+import pytest
+
+from skevgp.datasets import load_log
+
+COLUMNS = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Load a table of times, positions, velocities and efforts of a joint."""
+
+    def load(rows, **arguments):
+        np.savetxt(tmp_path / "log.csv", rows, delimiter=",", fmt="%.17g")
+        return load_log(tmp_path / "log.csv", **{"columns": COLUMNS, **arguments})
+
+    return load
