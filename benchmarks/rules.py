@@ -19,7 +19,7 @@ These numbers of the code are no rules, and are not switched off:
 * tolerances and rounding errors: `ENOUGH` and `LEAST_TOL` (the end of L-BFGS), `search._WORTH`, `_SEEN`,
   `parameters._AT_LIMIT`, `alone._ROUNDING`, `_NO_SIGNAL`, `model._BOUND_ROUNDING`, `grown._COARSE`,
   `outliers._PATIENCE`, `doubts._SETTLED`, `sharing._CONSTANT`, `_SHORT_TOL`, `units._ROUNDING`, `prior._ROUNDING`,
-  `calibration._LOWEST`, `_STEPS`, `inducing._DIGITS`, `folds._FLAT`, `rules.LOWEST_NOISE`;
+  `calibration._LOWEST`, `_STEP`, `_REACH`, `_CLOSE`, `inducing._DIGITS`, `folds._FLAT`, `rules.LOWEST_NOISE`;
 * sizes: `LARGEST_SAMPLE`, `MAX_SAMPLE`, `LARGEST_SEARCH`, `_ROWS_AT_ONCE`, `PREDICTED_ROWS`, `FEWEST_ROWS`,
   `calibration._MOST_ROWS`, `grown._SAMPLE`, `_ITERATIONS`, `model._GROWTH`, `sharing._SAMPLE`, `_POINTS`,
   `_FIRST_ITERATIONS`, `outliers._LOOK_ROWS`, `_LOOK_ITERATIONS`, `robust._NEIGHBOURS`, `_SAMPLE`, `messages._PAIRS`,
@@ -311,25 +311,9 @@ RULES_OFF = {
     ),
     "collinear": Rule("collinear features are no features", (constant(priors, "_COLLINEAR", 0.0),), "features"),
     "target-rounding": Rule("residuals below rounding have no unit", (constant(units, "_TARGET_ROUNDING", 0.0),)),
-    "products-again": Rule(
-        "products of collinear features are summed again",
-        (edited(units, "_triangles", "if all((diagonal_of(L) >= _SEEN).all() for L in lower):", "if True:"),),
-        "features",
-    ),
-    "varying": Rule(
-        "directions without data are left out of a step",
-        (
-            edited(
-                units._Step,
-                "of",
-                "if (np.abs(diagonal_of(upper)) >= _SEEN * sizes).all():",
-                "if True:",
-            ),
-        ),
-        "features",
-    ),
-    "refined-units": Rule(
-        "the fit of the features is refined", (edited(units, "features_alone", "range(3)", "range(1)"),), "features"
+    "rank": Rule("directions without data have no weight", (constant(units, "_ROUNDING", 0.0),), "features"),
+    "nearly-exact": Rule(
+        "residuals are fitted once more if features explain all", (constant(units, "_NEARLY_EXACT", 0.0),), "features"
     ),
     # The model.
     "refined-means": Rule("means are refined", (constant(sparse, "_REFINABLE", 0.0),), "sparse"),
@@ -375,14 +359,6 @@ RULES_OFF = {
         "a prior around the values of the bound",
         (edited(calibration.VarianceSearch, "_losses", "log_prior / n", "0.0 * log_prior / n"),),
         "folds groups",
-    ),
-    "search-at-limit": Rule(
-        "the noise is searched alone if the signal is at a limit",
-        (edited(calibration.VarianceSearch, "best", "if self.signal.low", "if True or self.signal.low"),),
-        "folds groups",
-    ),
-    "vertex": Rule(
-        "a parabola through the best points", (constant(calibration, "_vertex", lambda *losses: 0.0),), "folds groups"
     ),
     "dependent": Rule("a test of neighbouring rows", (constant(calibration, "_dependent", never),), "folds"),
     "path-test": Rule(
@@ -516,11 +492,16 @@ RULES_OFF = {
     ),
 }
 
-# Deleted rules whose rows are in the CSV. They are from commit e8757fa.
+# Deleted rules whose rows are in the CSV. They are from commit e8757fa, and so are those of the calibration.
 DELETED = {
     "evidence": "the likelier of two sets of outliers",
     "refinable": "means are not refined if B has no digits",
     "noise-factor": "a second estimate of the noise of rows that are no outliers",
+    "products-again": "products of collinear features are summed again",
+    "varying": "directions without data are left out of a step",
+    "refined-units": "the fit of the features is refined",
+    "search-at-limit": "the noise is searched alone if the signal is at a limit",
+    "vertex": "a parabola through the best points",
 }
 
 # --- problems ---------------------------------------------------------------------------------------------------------

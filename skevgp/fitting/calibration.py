@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
@@ -225,17 +226,18 @@ def _known_elsewhere(groups: Sequence[Sequence[LeftOut]]) -> list[list[Weights |
 
 # Replaces squares that vanish.
 _LOWEST = 1e-20
-# Ratios s²/σ² are powers of 2. First these exponents are tried around the start, then steps of these sizes, and never
-# more than so many doublings from the start.
-_LOOK, _STEPS, _FARTHEST = (-6, 0, 6), (3.0, 1.0, 0.25), 36
+# Logarithms of ratios s²/σ² are tried in such steps from that of the bound.
+_STEP = 4.0
+# Accuracy of logarithms of ratio and noise.
+_CLOSE = 0.05
 # Weight of the logarithm of the root mean square error next to the log density. The density alone hardly depends on the
 # mean of rows that are uncertain anyway.
 _SQUARES = 0.5
 # With few groups, the share of errors of a new one that lie within 2 standard deviations, and the fewest degrees of
 # freedom that are assumed.
 _INSIDE, _FEWEST_DEGREES = 0.97725, 3.0
-# Factors on the noise variance that are tried for a ratio.
-_NOISES = 2.0 ** np.arange(-3.0, 3.25, 0.5)
+# The best noise for a ratio is searched up to this factor from the one that makes variances as large as squared errors.
+_REACH = 8.0
 
 
 class Variance(NamedTuple):
@@ -272,11 +274,38 @@ class VarianceSearch:
 
     def best(self) -> tuple[float, float]:
         """The signal and noise variance with the lowest loss."""
-        signal, noise = self._along_ratios()
-        if self.signal.low == self.signal.high or not np.isclose(signal, self.signal[1:]).any():
+        (signal, s_low, s_high), (noise, low, high) = self.signal, self.noise
+        if s_low == s_high and low == high:
+            return s_low, low
+        # The maximum of the bound may be far outside of the limits.
+        least, most = np.log(s_low / high), np.log(s_high / low)
+        begin = float(np.clip(np.log(signal / noise), least, most))
+
+        tried: dict[float, tuple[float, float]] = {}
+
+        def loss(log_ratio: float) -> float:
+            if log_ratio not in tried:
+                tried[log_ratio] = self._at_ratio(float(np.exp(log_ratio)))
+            return tried[log_ratio][0]
+
+        def neighbours(log_ratio: float) -> list[float]:
+            return np.clip([log_ratio, log_ratio - _STEP, log_ratio + _STEP], least, most).tolist()
+
+        # There may be several minima. The lowest of a few ratios is followed by steps, and then improved.
+        best = min(neighbours(begin), key=loss)
+        while (lower := min(neighbours(best), key=loss)) != best:
+            best = lower
+        if not np.isfinite(loss(best)):
             return signal, noise
-        # The signal ended at a limit. It stays there, and the noise is searched alone.
-        return replace(self, signal=Variance(signal, signal, signal))._along_ratios()
+        _, *ends = neighbours(best)
+        if ends[0] < ends[1]:
+            minimize_scalar(loss, bounds=ends, options={"xatol": _CLOSE})
+        best = min(tried, key=loss)
+        ratio, noise = float(np.exp(best)), tried[best][1]
+        if s_low == s_high:
+            noise = s_low / ratio
+        noise = self.noise.clip(noise)
+        return self.signal.clip(ratio * noise), noise
 
     def loss(self, signal: float, noise: float) -> float:
         """Minus the mean log density of the held-out rows, without its constant."""
@@ -302,44 +331,6 @@ class VarianceSearch:
         degrees = max(len(scale) / max(2.0 * spread, 1e-6), _FEWEST_DEGREES)
         return float((student_t.ppf(_INSIDE, degrees) / norm.ppf(_INSIDE)) ** 2)
 
-    def _along_ratios(self) -> tuple[float, float]:
-        """Search the ratio s²/σ² by steps that shrink, and the noise variance for each ratio."""
-        (s2, s_low, s_high), (n2, low, high) = self.signal, self.noise
-        if s_low == s_high and low == high:
-            return s_low, low
-        # The maximum of the bound may be far outside of the limits.
-        begin = float(np.clip(np.round(np.log2(s2 / n2)), np.log2(s_low / high), np.log2(s_high / low)))
-        tried: dict[float, tuple[float, float]] = {}
-
-        def loss(k: float) -> float:
-            if abs(k - begin) > _FARTHEST:
-                return np.inf
-            if k not in tried:
-                tried[k] = self._at_ratio(2.0**k)
-            return tried[k][0]
-
-        best = min((begin + step for step in _LOOK), key=loss)
-        for step in _STEPS:
-            while (k := min((best, best - step, best + step), key=loss)) != best:
-                best = k
-        if not np.isfinite(loss(best)):
-            return s2, n2
-        # The minimum of the parabola through the losses at the last three ratios.
-        step, nothing, shift = _STEPS[-1], (np.inf, np.nan), 0.0
-        (here, noise), (before, noise_before), (after, noise_after) = (
-            tried.get(best + side * step, nothing) for side in (0, -1, 1)
-        )
-        if np.isfinite(before + after):
-            shift = _vertex(before, here, after)
-            noise *= (noise_after / noise if shift > 0.0 else noise / noise_before) ** shift
-        ratio = 2.0 ** (best + step * shift)
-        if low == high:
-            noise = low
-        signal = ratio * noise
-        if s_low == s_high:
-            signal, noise = s_low, s_low / ratio
-        return self.signal.clip(signal), self.noise.clip(noise)
-
     def _at_ratio(self, ratio: float) -> tuple[float, float]:
         """The lowest loss at a ratio s²/σ², and the noise variance there."""
         (_, s_low, s_high), (at_bound, low, high) = self.signal, self.noise
@@ -347,22 +338,22 @@ class VarianceSearch:
         low, high = max(low, s_low / ratio * (1.0 - 1e-9)), min(high, s_high / ratio * (1.0 + 1e-9))
         if low > high:
             return np.inf, np.nan
-        if high < low * 1.01:
-            middle = np.array([np.sqrt(low * high)])
-            return float(self._losses(ratio, middle)[0]), float(middle[0])
-        noise = np.clip(at_bound, low, high)
+        noise = float(np.clip(at_bound, low, high))
         # If variances were proportional to the noise, this would make squared errors as large as variances.
-        for _ in range(2):
-            excess = float(self._means(ratio, np.array([noise]))[2][0])
-            noise = np.clip(noise * max(excess, 1e-12), low, high)
-        grid = np.clip(noise * _NOISES, low, high)
-        losses = self._losses(ratio, grid)
-        best = int(np.argmin(losses))
-        if not 0 < best < len(grid) - 1 or not grid[best - 1] < grid[best] < grid[best + 1]:
-            return float(losses[best]), float(grid[best])
-        shift = _vertex(*losses[best - 1 : best + 2])
-        noise = grid[best] * (_NOISES[1] / _NOISES[0]) ** shift
-        return float(losses[best] + 0.25 * shift * (losses[best + 1] - losses[best - 1])), float(noise)
+        excess = float(self._means(ratio, np.array([noise]))[2][0])
+        noise = float(np.clip(noise * max(excess, _LOWEST), low, high))
+
+        def loss(log_noise: float) -> float:
+            return float(self._losses(ratio, np.exp([log_noise]))[0])
+
+        ends = np.log(np.clip([noise / _REACH, noise * _REACH], low, high))
+        if ends[1] - ends[0] < _CLOSE:
+            return loss(np.log(noise)), noise
+        inside = float(minimize_scalar(loss, bounds=ends, options={"xatol": _CLOSE}).x)
+        # SciPy does not try the ends.
+        candidates = [inside, *(end for end in ends if abs(end - inside) < 2.0 * _CLOSE)]
+        best = min(candidates, key=loss)
+        return loss(best), float(np.exp(best))
 
     def _losses(self, ratio: float, noise: np.ndarray) -> np.ndarray:
         """The objective (g,), in nats per row, at noise variances (g,)."""
@@ -386,9 +377,3 @@ class VarianceSearch:
             excess += counts @ scaled
             n += counts.sum()
         return density / n, squares / n, excess / n
-
-
-def _vertex(before: float, here: float, after: float) -> float:
-    """Where a parabola through three points one step apart is lowest, in steps from the middle one, the lowest."""
-    curvature = before - 2.0 * here + after
-    return 0.0 if curvature <= 0.0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
