@@ -128,9 +128,9 @@ def test_fixed_noise_and_signal_are_kept():
     kernel = ConstantKernel() * RBF([1.0, 1.0]) + WhiteKernel(0.3, "fixed")
     plain, noise_fixed = (fitted(None, kernel=kernel, max_iter=5, noise_cv=noise_cv) for noise_cv in (None, 5))
     np.testing.assert_allclose(noise_fixed.noise_variance_, 0.3)
-    assert all(
-        k.k1.constant_value != own.k1.constant_value for k, own in zip(plain.kernel_, noise_fixed.kernel_, strict=True)
-    )
+    # The lowest noise counts as none, and then the signal does not rise.
+    signals, calibrated = ([kernel.k1.constant_value for kernel in own.kernel_] for own in (plain, noise_fixed))
+    assert (np.array(calibrated) <= (1.0 + 1e-9) * np.array(signals)).all()
     signal_fixed = fitted(kernel=ConstantKernel(1.0, "fixed") * RBF([1.0, 1.0]), max_iter=5)
     np.testing.assert_allclose([k.k1.constant_value for k in signal_fixed.kernel_], 1.0)
     plain, both = (
