@@ -1,18 +1,19 @@
 """The bounds written down from the data in plain autograd.numpy: no statistics, no blocks, no hand-written gradient."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from types import SimpleNamespace
 
 import autograd.numpy as anp
 import numpy as np
 
 from skevgp.data.blocks import LocalBlocks
 from skevgp.data.dataset import Dataset
-from skevgp.data.rows import LocalSource, Moments, RawRows, Rows, block_of
-from skevgp.fitting.rules import Rules
+from skevgp.data.rows import LocalSource, RawRows, Rows, block_of
+from skevgp.fitting.problem import Problem
+from skevgp.fitting.rules import RULES, Rules
 from skevgp.fitting.start import starting_table
-from skevgp.kernels.parse import Start, Starts
+from skevgp.fitting.units import Units
+from skevgp.kernels.parse import Start, Starts, parse_kernel
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import LOG_2PI, Variant
 from skevgp.model.left_out import LeftOut, Seen, sums_of_others
@@ -151,8 +152,7 @@ class Dense:
         total = 0.0
         for o in self.outputs:
             targets = self.residuals[:, [o]] + self.H @ (self.prior.mean - self.prior.offset)[[o]].T
-            rows = SimpleNamespace(inputs=self.X, features=self.H, targets=targets, counts=None, precision=None)
-            alone = Dense(rows, self.prior.outputs([o]))
+            alone = Dense(RawRows(self.X, self.H, targets), self.prior.outputs([o]))
             names = ("signal", "noise", *(["coef_factors"] if self.prior.groups is not None else []))
             its = values | {name: values[name][[o]] for name in names}
             its["inducing_points"] = values["inducing_points"][[o % len(values["inducing_points"])]]
@@ -254,16 +254,25 @@ def identity_rows(inputs, residuals):
     return Rows(LocalSource.holding(RawRows(inputs, np.empty((len(inputs), 0)), residuals)), lambda raw: raw)
 
 
-def table_of(inputs, points, starts, scatter, n_hyperparameters, rules=Rules(1e-2), **options):  # noqa: B008
+@dataclass(frozen=True)
+class RuledProblem(Problem):
+    """A problem with rules of the search that a test chooses."""
+
+    rules: Rules = RULES
+
+
+def table_of(inputs, points, starts, scatter, covariance, rules=Rules(1e-2), **options):  # noqa: B008
     """The parameters of a model of rows with such inputs, whose internal units are the user's."""
-    none = np.zeros(len(scatter))
-    units = SimpleNamespace(target_unit=none + 1.0, constant=none > 0.0, rounding=none, target_scatter=none + 1.0)
-    units.prior = SimpleNamespace(labels=(), n_groups=0, shared=False)
-    spec = SimpleNamespace(starts=starts, covariance=SimpleNamespace(n_hyperparameters=n_hyperparameters))
-    rows = SimpleNamespace(
-        inputs=Moments.of(inputs), columns=slice(None), mean_precision=1.0, scatter=lambda: np.asarray(scatter)
+    residuals = np.linspace(-1.0, 1.0, len(inputs))
+    rows = identity_rows(inputs, np.multiply.outer(residuals / residuals.std(), np.sqrt(scatter)))
+    none = np.zeros((len(scatter), 0))
+    zero, unit = np.zeros(len(scatter)), np.ones(len(scatter))
+    units = Units(zero, unit, CoefficientPrior(none, none, none), unit, zero, zero > 0.0)
+    spec = replace(parse_kernel(None, inputs.shape[-1]), covariance=covariance, starts=starts)
+    shapes = inputs.shape[1:], (0,)
+    return starting_table(
+        RuledProblem(rows.source, units, spec, none > 0.0, shapes, rules=rules), rows, points, **options
     )
-    return starting_table(SimpleNamespace(units=units, spec=spec, rules=rules), rows, points, **options)
 
 
 def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
@@ -277,7 +286,7 @@ def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     model = SparseModel(SquaredExponential(d), prior, groups, Variant(family))
     Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
-    return model, rows, table_of(X, Z, Starts(*starts), np.ones(o), d)
+    return model, rows, table_of(X, Z, Starts(*starts), np.ones(o), model.kernel)
 
 
 def with_groups(model, table):

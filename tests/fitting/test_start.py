@@ -46,7 +46,7 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     rules = Rules(1e-4, 1e-10, lengthscale=0.5, **limits)
     scatter, points = np.array([1.0, 0.01]), np.zeros((1, 3, 2))
     starts = Starts(Start(), Start(), Start())
-    table = table_of(X, points, starts, scatter, 2, rules)
+    table = table_of(X, points, starts, scatter, SquaredExponential(2), rules)
     first, (sigma, root) = table.values(table.start()), (X.std(axis=0), np.sqrt(2.0))
     np.testing.assert_allclose(first["hyperparameters"], 0.5 * root * sigma)
     np.testing.assert_allclose(first["signal"], 1.0)

@@ -34,8 +34,7 @@ def model_with(kernel, shared=True, **sizes):
     points = table["inducing_points"].start
     starts = Starts(spec.starts.hyperparameters, Start(np.array([0.7])), Start(np.array([0.2])))
     variance = checked_variance(covariance, spec.starts.hyperparameters.value, points[0])
-    size = covariance.n_hyperparameters
-    table = table_of(rows.inputs, points, starts, np.ones(2), size, mean_variance=variance)
+    table = table_of(rows.inputs, points, starts, np.ones(2), covariance, mean_variance=variance)
     return SparseModel(covariance, model.prior, model.groups), rows, table
 
 

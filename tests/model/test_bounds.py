@@ -52,7 +52,7 @@ def test_gradient_with_one_lengthscale_for_all_columns():
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, model.groups)
     starts, points = Starts(Start(), Start(), Start()), table["inducing_points"].start
-    table = table_of(rows.inputs, points, starts, np.ones(2), 1, Rules(0.1))
+    table = table_of(rows.inputs, points, starts, np.ones(2), model.kernel, Rules(0.1))
     loss = plain_loss(model, rows, table)
     value, gradient = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
     assert relative_error(gradient, grad(loss)(table.start())) < 1e-9
