@@ -258,7 +258,7 @@ class EGPRegressor(GaussianProcess):
         progress = monitor_of(self.verbose, max_time=self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             data = Dataset.from_user(self, X, y, sample_weight, relative_variance)
-            problem = self._problem(data)
+            problem = replace(self._problem(data), max_iter=0 if self.optimizer is None else self.max_iter)
             rng, vague = check_random_state(self.random_state), problem.vague
 
             def fit(problem: Problem, previous: Fitted | None, rough: bool, about: str) -> Fitted:
@@ -266,7 +266,6 @@ class EGPRegressor(GaussianProcess):
                 problem = replace(
                     problem,
                     solver=self._solver(problem.units.target_unit),
-                    max_iter=0 if self.optimizer is None else self.max_iter,
                     tol=max(tol, rough_tol(problem)) if rough else tol,
                 )
                 return fit_model(problem, rng, monitor.seen_as(about=about), previous)
