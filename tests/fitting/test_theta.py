@@ -87,6 +87,11 @@ def test_posterior_is_that_of_mcmc(name):
     assert correlation == pytest.approx(np.corrcoef(draws.T)[0, -1] if len(std) > 1 else 1.0, abs=0.1)
 
 
+def test_exact_model_is_the_sparse_one_with_all_points():
+    expected = with_all_points(noise_cv=None).fit(X, Y[:, 0])
+    assert_same_theta(EGPRegressor(WAVE, random_state=0).fit(X, Y[:, 0]), expected)
+
+
 @pytest.mark.parametrize("discrepancy", ["free", "orthogonal"])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("n_outputs", [1, 2])
