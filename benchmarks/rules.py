@@ -6,7 +6,7 @@
 
 A rule is code that changes the fit of rare data. `RULES_OFF` lists the rules, and how each is switched off. `PROBLEMS`
 lists the problems. A rule runs on the problems that have one of its tags. Two controls change what should not matter.
-They show how much results vary by chance: about one run in seven is worse by more than 1 %. The time of the processor
+They show how much results vary by chance: about one run in six is worse by more than 1 %. The time of the processor
 depends on what else runs on the machine. Ratios between 0.75 and 1.25 mean nothing.
 
 The CSV has a row for each rule, problem and seed. `bound` is in nats per row and output. `rmse` and `nlpd` are of new

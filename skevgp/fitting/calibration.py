@@ -280,7 +280,7 @@ class VarianceSearch:
         # The maximum of the bound may be far outside of the limits.
         least, most = np.log(s_low / high), np.log(s_high / low)
         begin = float(np.clip(np.log(signal / noise), least, most))
-
+        # The lowest loss and its noise variance, for each logarithm of a ratio.
         tried: dict[float, tuple[float, float]] = {}
 
         def loss(log_ratio: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from ..data.rows import Rows, Source
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values
-from ..model.posterior import Posterior, SparsePosterior
+from ..model.posterior import AnyPosterior, SparsePosterior
 from ..model.predictor import CoefficientPrior, Predictor
 from ..model.statistics import Kernel
 from ..model.weights import WeightLikelihood
@@ -24,7 +24,7 @@ class FittedModel:
 
     # Columns of y.
     outputs: list[int]
-    posterior: Posterior
+    posterior: AnyPosterior
     # The limits and the start of the parameters.
     table: ParameterTable
     loss_curve: list[float]
@@ -58,13 +58,13 @@ class FittedModel:
 
     @property
     def predictor(self) -> Predictor:
-        """The predictor of residuals, with the noise variance of rows that are not outliers."""
+        """The predictor of residuals."""
         return self.posterior.predictor
 
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
         """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.
 
-        ``weight`` multiplies the log likelihood of the earlier rows.
+        ``weight`` multiplies the log likelihood of the earlier rows. It must be 1 for noise with heavy tails.
         """
         if self.doubts is not None:
             return self._updated_doubting(self.doubts, rows)

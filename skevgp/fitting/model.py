@@ -16,7 +16,7 @@ from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
-from ..model.posterior import ExactPosterior, Posterior, SparsePosterior
+from ..model.posterior import AnyPosterior, ExactPosterior, SparsePosterior
 from ..model.statistics import SufficientStatistics
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
@@ -140,7 +140,7 @@ class Model:
             return LikelihoodObjective(self.exact, table)
         return BoundObjective(self.sparse, table, self.blocks)
 
-    def posterior(self, values: Values, statistics: list[SufficientStatistics] | None = None) -> Posterior:
+    def posterior(self, values: Values, statistics: list[SufficientStatistics] | None = None) -> AnyPosterior:
         """The posterior at some values. The ``statistics`` of all rows at these are computed if they are None."""
         if self.exact is not None:
             # Fewer points than rows make predictions cheaper. The jitter of k(X_m, X_m) would show in a small std.

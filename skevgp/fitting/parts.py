@@ -90,11 +90,10 @@ def models_of(
     """The models of a problem, each with its rows and its start. Arguments are those of `fit_model`."""
     parts = parts_of(problem)
     common = _Common.of(problem, rng, threads, len(parts))
-    goes_on = previous is not None and previous.outputs == [part.outputs for part in parts]
     models = []
     for number, part in enumerate(parts):
-        warm: Values | None = None
-        if goes_on and previous is not None:
+        warm: Values = {}
+        if previous is not None and previous.outputs == [other.outputs for other in parts]:
             warm = previous.values_in(problem.units, common.rows, common.kernels_of(part)[0], number)
             if isinstance(problem.placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
@@ -154,10 +153,10 @@ class _Common:
         """The kernel of each set of inducing points."""
         return tuple(self.kernels[output % len(self.kernels)] for output in part.first_outputs)
 
-    def model(self, part: Part, warm: Values | None, monitor: Monitor) -> Model:
+    def model(self, part: Part, warm: Values, monitor: Monitor) -> Model:
         """The model of some outputs. ``warm`` are the values of another fit, as far as they are useful."""
         problem, units, outputs, kernels = self.problem, self.problem.units, part.outputs, self.kernels_of(part)
-        start, placed = self._start(part, {} if warm is None else warm)
+        start, placed = self._start(part, warm)
         complete = self._is_complete(start, part)
         exact = complete and not part.separate and problem.may_be_exact
         n_kernels = len(start) if part.separate else None
@@ -192,7 +191,7 @@ class _Common:
             ),
             max_iter=problem.max_iter,
             tol=problem.tol,
-            warm=None if warm is None else table.started_at(warm).values_at_start(),
+            warm=table.started_at(warm).values_at_start() if warm else None,
             placed=placed,
             is_exact=exact,
         )

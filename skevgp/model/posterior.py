@@ -1,7 +1,7 @@
 """The posterior at the end of a fit. `SparsePosterior` and `ExactPosterior` have the same methods.
 
-A new approximation is another class with these: ``bound``, ``upper_bound``, ``predictor``, ``n_contrasts``,
-`weight_likelihoods`, `moved` and `updated`.
+A new approximation is another class with these: ``sparse``, ``values``, ``bound``, ``upper_bound``, ``predictor``,
+``n_contrasts``, `weight_likelihoods`, `moved` and `updated`. It is added to `AnyPosterior`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..data.blocks import Blocks
-from ..data.rows import Rows
+from ..data.rows import RawRows, Rows
 from .exact import ExactModel
 from .model import SparseModel
 from .parameters import Values
@@ -109,7 +109,8 @@ class SparsePosterior:
     def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
         """The posterior with new rows: q is at its optimum for all of them.
 
-        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is that of a sparse model.
+        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is the lowest noise of sparse
+        models. Only an exact model may have less.
         """
         # Points that were all rows before are not all rows now.
         sparse, before = replace(self.sparse, complete=False), self.statistics
@@ -170,18 +171,16 @@ class ExactPosterior:
         self, prior: CoefficientPrior | None = None, rows: Rows | None = None
     ) -> list[WeightLikelihood]:
         """The likelihood of the weights of each output, as of `SparsePosterior`."""
-        sparse, exact = self.sparse, self.exact
-        if prior is not None and rows is not None:
-            sparse, exact = self._with(prior, rows)
+        raw = self.exact.rows if rows is None else _all(rows)
+        sparse, exact = self._with(self.exact.prior if prior is None else prior, raw)
         if sparse.variant.orthogonal:
-            return sparse.weight_likelihoods(
-                self.values, sparse.statistics(self.values, _blocks_of(sparse, exact, self.values))
-            )
+            statistics = sparse.statistics(self.values, _blocks_of(sparse, exact, self.values))
+            return sparse.weight_likelihoods(self.values, statistics)
         return exact.weight_likelihoods(self.values)
 
     def moved(self, prior: CoefficientPrior, rows: Rows) -> ExactPosterior:
         """The posterior for other features of the same rows, at the same values."""
-        return ExactPosterior.of(*self._with(prior, rows), self.values)
+        return ExactPosterior.of(*self._with(prior, _all(rows)), self.values)
 
     def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
         """The posterior of the sparse model with new rows, as of `SparsePosterior`."""
@@ -191,15 +190,20 @@ class ExactPosterior:
         before = SparsePosterior(self.sparse, values, statistics, known_whitenings=whitenings)
         return before.updated(rows, weight, lowest_noise)
 
-    def _with(self, prior: CoefficientPrior, rows: Rows) -> tuple[SparseModel, ExactModel]:
+    def _with(self, prior: CoefficientPrior, rows: RawRows) -> tuple[SparseModel, ExactModel]:
+        """Both models with another prior, and with these rows."""
         # Features that are new have weights with a proper prior.
         vague = np.zeros(prior.scale.shape, dtype=bool)
         vague[:, : self.exact.vague.shape[1]] = self.exact.vague
-        exact = replace(self.exact, prior=prior, vague=vague, rows=rows.some(np.arange(len(rows))))
+        exact = replace(self.exact, prior=prior, vague=vague, rows=rows)
         return replace(self.sparse, prior=prior), exact
 
 
-Posterior = SparsePosterior | ExactPosterior
+AnyPosterior = SparsePosterior | ExactPosterior
+
+
+def _all(rows: Rows) -> RawRows:
+    return rows.some(np.arange(len(rows)))
 
 
 def _blocks_of(sparse: SparseModel, exact: ExactModel, values: Values) -> Blocks:
