@@ -109,8 +109,8 @@ class SparsePosterior:
     def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
         """The posterior with new rows: q is at its optimum for all of them.
 
-        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is the lowest noise of sparse
-        models. Only an exact model may have less.
+        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is the lowest noise of a
+        sparse model. Only an exact model may have less.
         """
         # Points that were all rows before are not all rows now.
         sparse, before = replace(self.sparse, complete=False), self.statistics
