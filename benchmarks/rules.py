@@ -301,7 +301,7 @@ RULES_OFF = {
     ),
     "widest-noise": Rule(
         "the noise may rise to the variance of y",
-        (edited(parts, "starting_table", "np.maximum(highest, units.target_scatter[own] * precision)", "None"),),
+        (edited(parts, "starting_table", "np.maximum(highest, units.target_scatter[columns] * precision)", "None"),),
         "features",
     ),
     "moderate-prior": Rule("a moderate prior for few rows", (constant(problem, "_ENOUGH", 0),), "features"),
@@ -316,7 +316,11 @@ RULES_OFF = {
         "residuals are fitted once more if features explain all", (constant(units, "_NEARLY_EXACT", 0.0),), "features"
     ),
     # The model.
-    "refined-means": Rule("means are refined", (constant(sparse, "_REFINABLE", 0.0),), "sparse"),
+    "refined-means": Rule(
+        "means are refined",
+        (edited(sparse.SparseModel, "at_optimum", "if blocks is None or self.prior.shared else", "if True else"),),
+        "sparse",
+    ),
     "high-ratio": Rule("the exact predictor for a high ratio", (constant(model, "_HIGH_RATIO", np.inf),), "complete"),
     "exact-predictor": Rule(
         "the exact predictor for points at all rows",
@@ -324,7 +328,7 @@ RULES_OFF = {
         "complete",
     ),
     # Calibration.
-    "calibration": Rule("calibration as a whole", (constant(fit, "calibrated", nothing),), "folds groups"),
+    "calibration": Rule("calibration as a whole", (constant(fit, "calibrate", nothing),), "folds groups"),
     "wider": Rule(
         "calibration widens the limits of the signal", (constant(calibration, "_WIDER", 1.0),), "folds groups"
     ),
@@ -387,7 +391,7 @@ RULES_OFF = {
                 calibration,
                 "_by_folds",
                 "dependent, still = 0, False, rows.is_constant()",
-                "dependent, still = 0, False, np.zeros(len(found), dtype=bool)",
+                "dependent, still = 0, False, np.zeros(len(best_of), dtype=bool)",
             ),
         ),
         "constant",
@@ -405,11 +409,11 @@ RULES_OFF = {
             edited(
                 outliers,
                 "_first_doubts",
-                "robust, from_robust = _robust_doubts(",
+                "robust = _robust_doubts(",
                 "plain = replace(short, rows=rows.subset(chosen))\n"
                 "    scales = model.problem.noise.row_scales(len(model.scatter), np.zeros(len(rows)))\n"
                 "    return _first_of(look_at(rows, predictor_at(plain, search(plain).values)), scales)\n"
-                "    robust, from_robust = _robust_doubts(",
+                "    robust = _robust_doubts(",
             ),
         ),
         "robust",
@@ -420,7 +424,7 @@ RULES_OFF = {
     ),
     "plain-look": Rule(
         "a fit to all rows shows outliers too",
-        (edited(outliers, "_first_doubts", "if robust.rejected is None:", "if True:"),),
+        (edited(outliers, "_first_doubts", "if robust.rejected is None or", "if True or"),),
         "robust",
     ),
     "share-of-noise": Rule("a lowest scale of errors", (constant(outliers, "_SHARE_OF_NOISE", 0.0),), "robust"),
@@ -452,7 +456,7 @@ RULES_OFF = {
     ),
     "folds-without-outliers": Rule(
         "calibration leaves out outliers",
-        (edited(fit, "_calibrated", "if doubts is not None and doubts.rejected is not None:", "if False:"),),
+        (edited(fit, "_calibration", "if doubts is not None and doubts.rejected is not None:", "if False:"),),
         "robust",
     ),
     # Outputs that share a kernel.

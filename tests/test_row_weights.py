@@ -127,6 +127,16 @@ def test_partial_fit_with_weights_is_one_pass(posterior):
     assert_same(begun, evgp(solver=LBFGS(posterior=posterior), max_iter=5).fit(X[first], Y[first], NOISE[first]))
 
 
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_partial_fit_after_an_exact_fit_does_not_depend_on_the_unit_of_variances(unit):
+    def predicted(unit):
+        model = EVGPRegressor(n_inducing=N, random_state=0)
+        model.fit(X[:30], X[:30, 0] ** 2, relative_variance=np.full(30, unit))
+        return model.partial_fit(X[30:], X[30:, 0] ** 2, relative_variance=np.full(N - 30, unit)).predict(X)
+
+    np.testing.assert_allclose(predicted(unit), predicted(1.0), atol=1e-3)
+
+
 @pytest.mark.parametrize("as_dask", [True, False])
 def test_dask(as_dask):
     import dask.array as da

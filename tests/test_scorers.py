@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sklearn
 from scipy.stats import norm
-from sklearn.base import clone
+from sklearn.base import BaseEstimator, clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
 from sklearn.ensemble import BaggingRegressor
@@ -25,22 +25,22 @@ from sklearn.multioutput import MultiOutputRegressor, RegressorChain
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, metrics
 from skevgp.datasets import make_toy
 from skevgp.metrics import (
     crps,
     make_std_scorer,
-    neg_calibration_error,
     neg_crps,
     neg_nlpd,
     negative_log_predictive_density,
 )
+from skevgp.utils.scorers import StdScorer
 
 X, y = (part[np.random.RandomState(0).permutation(60)] for part in make_toy(60, random_state=0, return_X_y=True))
 Y = np.column_stack([y, 3.0 - 2.0 * X[:, 0]])
 GROUPS = np.repeat(np.arange(12), 5)
 SPARSE = EVGPRegressor(n_inducing=5, max_iter=0, random_state=0)
-SCORERS = [neg_nlpd, neg_crps, neg_calibration_error]
+SCORERS = [one for one in vars(metrics).values() if isinstance(one, StdScorer)]
 
 
 def nlpd_of(model, inputs=X, targets=y):
@@ -66,14 +66,29 @@ def test_score_is_minus_the_metric_of_mean_and_std(model):
 
 
 @pytest.mark.parametrize("search", [GridSearchCV, partial(HalvingGridSearchCV, random_state=1)], ids=["all", "halving"])
-@pytest.mark.parametrize("scorer", SCORERS[:1], ids=repr)
-def test_searches_choose_the_noise_that_is_there(search, scorer):
+def test_searches_choose_the_noise_that_is_there(search):
     """Of fixed ones; a score of means alone could not tell the largest from the true one."""
     kernels = [RBF(2.0) + WhiteKernel(noise, "fixed") for noise in (1e-4, 3.0, 3000.0)]
-    grid = search(EGPRegressor(max_iter=0), {"kernel": kernels}, scoring=scorer, cv=3, error_score="raise")
+    grid = search(EGPRegressor(max_iter=0), {"kernel": kernels}, scoring=neg_nlpd, cv=3, error_score="raise")
     found = grid.fit(X, y)
     assert found.best_params_["kernel"] == kernels[1]
-    assert scorer(found, X, y) == scorer(found.best_estimator_, X, y)
+    assert neg_nlpd(found, X, y) == neg_nlpd(found.best_estimator_, X, y)
+
+
+@pytest.mark.parametrize("scorer", SCORERS, ids=repr)
+def test_higher_scores_are_of_better_predictions(scorer):
+    """Of the true mean and standard deviation, against predictions that are ten standard deviations off."""
+
+    class Known(BaseEstimator):
+        def __init__(self, error):
+            self.error = error
+
+        def predict(self, X, return_std=False):
+            return X[:, 0] + self.error, np.full(len(X), 1.0)
+
+    inputs = np.random.RandomState(0).randn(500, 2)
+    targets = inputs.sum(axis=1)
+    assert scorer(Known(0.0), inputs, targets) > scorer(Known(10.0), inputs, targets)
 
 
 def test_scorer_says_how_it_was_made():

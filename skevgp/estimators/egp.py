@@ -404,15 +404,15 @@ class EGPRegressor(GaussianProcess):
         if clone_kernel and width == (len(given),) != (len(order),):
             order = given
             if self._spec.adds_signal:
-                fitted = [np.append(own[:-2], [1.0, own[-1]]) for own in fitted]
+                fitted = [np.append(numbers[:-2], [1.0, numbers[-1]]) for numbers in fitted]
         with single_threaded_libraries():
-            found = value_at(theta, eval_gradient, order, fitted, self._log_likelihood_of)
-        found = (found[0] - self._counted_twice, found[1]) if eval_gradient else found - self._counted_twice
+            value = value_at(theta, eval_gradient, order, fitted, self._log_likelihood_of)
+        value = (value[0] - self._counted_twice, value[1]) if eval_gradient else value - self._counted_twice
         if not clone_kernel:
             kernels, thetas = np.atleast_1d(self.kernel_), np.atleast_2d(np.asarray(theta, dtype=np.float64))
-            for kernel, own in zip(kernels, thetas, strict=True):
-                kernel.theta = own
-        return found
+            for kernel, theta_of_kernel in zip(kernels, thetas, strict=True):
+                kernel.theta = theta_of_kernel
+        return value
 
     def _log_likelihood_of(self, output: int, numbers: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log likelihood of an output at other numbers, and its gradient in their logarithms.
@@ -497,14 +497,14 @@ class UserOptimizer(Solver):
 
         with monitor.keeping_the_best():
             bounds = np.column_stack(limits) + in_users_units[:, np.newaxis]
-            found = self.optimizer(of_theta, start + in_users_units, bounds=bounds)
+            result = self.optimizer(of_theta, start + in_users_units, bounds=bounds)
             try:
-                theta, _ = found
+                theta, _ = result
                 theta = np.asarray(theta, dtype=float)
             except (TypeError, ValueError):
                 theta = np.empty(0)
             if theta.shape != start.shape or not np.isfinite(theta).all():
-                raise ValueError(f"optimizer must return {len(start)} finite numbers and their value; got {found!r}.")
+                raise ValueError(f"optimizer must return {len(start)} finite numbers and their value; got {result!r}.")
             best.x = np.clip(theta - in_users_units, lower, upper)
             best.loss = objective(best.x)[0]
         return best
@@ -530,13 +530,13 @@ def value_at(
     n_outputs, thetas = len(fitted), as_floats(theta, "theta")
     shape = (len(order),) if n_outputs == 1 else (n_outputs, len(order))
     if thetas.shape != shape:
-        each = "" if n_outputs == 1 else " of each of the kernels"
-        raise ValueError(f"theta must be of shape {shape}, as kernel_.theta{each}; got {thetas.shape}.")
+        which = "" if n_outputs == 1 else " of each of the kernels"
+        raise ValueError(f"theta must be of shape {shape}, as kernel_.theta{which}; got {thetas.shape}.")
     if not (np.abs(thetas) <= np.log(LARGEST)).all():
         raise ValueError(f"theta must be logarithms of numbers from {1 / LARGEST:g} to {LARGEST:g}; got {theta!r}.")
     total, gradient = 0.0, np.zeros((n_outputs, len(order)))
-    for o, own in enumerate(fitted):
-        numbers = own.copy()
+    for o, numbers_of_fit in enumerate(fitted):
+        numbers = numbers_of_fit.copy()
         numbers[order] = np.exp(thetas.reshape(gradient.shape)[o])
         try:
             with np.errstate(over="ignore", invalid="ignore"):

@@ -31,7 +31,7 @@ from ..model.bounds import Variant
 from ..noise import as_noise
 from ..noise.base import Noise
 from ..noise.gaussian import input_covariance, relative_noise
-from ..solvers import as_solver
+from ..solvers import as_solver, solvers_of_all_rows
 from ..solvers.base import Solver
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
@@ -425,11 +425,11 @@ class EVGPRegressor(GaussianProcess):
         if not isinstance(self.n_inducing, str):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
         elif solver.stochastic:
-            raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
+            raise ValueError(f'n_inducing="auto" needs {solvers_of_all_rows()}; got solver={self.solver!r}.')
         asked = f"noise={self.noise!r}" if noise.heavy_tails else "inputs of Gaussian noise"
         if (noise.heavy_tails or noise.inputs is not None) and (solver.stochastic or is_dask(X)):
             raise ValueError(
-                f'{asked} needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
+                f"{asked} needs {solvers_of_all_rows()}, and rows in memory or in a file; got "
                 f"solver={self.solver!r} and X of type {type(X).__name__}."
             )
 

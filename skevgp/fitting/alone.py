@@ -44,17 +44,24 @@ def best_by_sums(
 ) -> tuple[float, np.ndarray]:
     """The highest bound with q(f) at its prior of a given signal (o,), and the noise variances (o,) for it."""
     values, prior = table.values_at_start(), sparse.prior
-    points, (kernel, hyperparameters) = values["inducing_points"][0], sparse.kernel_of(values, 0)
-    variance = np.mean(kernel.at(hyperparameters, points).diagonal(kernel.prepare(points)))
+    variance = np.empty(len(signal))
+    for group, (outputs, points) in enumerate(zip(sparse.groups, values["inducing_points"], strict=True)):
+        kernel, hyperparameters = sparse.kernel_of(values, group)
+        variance[outputs] = np.mean(kernel.at(hyperparameters, points).diagonal(kernel.prepare(points)))
     trace = signal * variance * rows.total * rows.mean_precision
-    least = highest = noise_left_over(rows, sums, trace)
-    if hidden:
-        lowest, highest = table["noise"].value_limits().T
+    lowest, highest = table["noise"].value_limits().T
+    if not hidden:
+        least = highest = np.clip(noise_left_over(rows, sums, trace), lowest, highest)
+    else:
         # Directions without data have a precision of 1, which is lost in rounding next to large features.
         sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1))[0]) for o, scale in enumerate(prior.scale)]
         unseen = [np.sort(of_output)[: max(len(of_output) - sums.length, 0)].sum() for of_output in sizes]
         least = np.maximum(lowest, _ROUNDING * np.array(unseen))
-    return noise_of_most_evidence(lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared)
+
+    def evidence(noise: np.ndarray) -> np.ndarray:
+        return bounds_alone(sums, prior, noise, trace)
+
+    return noise_of_most_evidence(evidence, least, highest, prior.shared)
 
 
 def best_by_likelihood(

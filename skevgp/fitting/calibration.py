@@ -58,7 +58,7 @@ _EXPLAINED, _GAIN = 0.5, 0.01
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class Calibration:
     """Signal and noise variances (o,) after calibration."""
 
     signal: np.ndarray
@@ -69,7 +69,7 @@ class Calibrated:
     dependent: bool = False
 
 
-def calibrated(
+def calibrate(
     model: SparseModel,
     values: Values,
     statistics: list[SufficientStatistics],
@@ -77,7 +77,7 @@ def calibrated(
     rows: Rows,
     by: CrossValidation,
     seed: int,
-) -> Calibrated | None:
+) -> Calibration | None:
     """Calibrate signal and noise. None if both are fixed, there are too few rows, or a matrix is not finite.
 
     ``statistics`` are those of all rows at ``values``. ``table`` has the limits. ``seed`` draws the folds.
@@ -105,7 +105,7 @@ def _by_folds(
     by: CrossValidation,
     folds: list[Fold],
     rng: np.random.RandomState,
-) -> Calibrated:
+) -> Calibration:
     """Search the variances of each output, then test whether groups and neighbours agree with them."""
     (s_low, s_high), (low, high) = (table[name].value_limits().T for name in ("signal", "noise"))
     wider, left_over = _WIDER if by.wide else 1.0, _left_over(model, values, statistics)
@@ -118,54 +118,56 @@ def _by_folds(
     else:
         signals = variances(table["signal"], at_bound, np.clip(at_bound, s_low, s_high), s_high)
     searches = _searches(model, values, folds, rows, signals, noises)
-    found = list(rows.threads(VarianceSearch.best, searches))
+    best_of = list(rows.threads(VarianceSearch.best, searches))
     gone, dependent, still = 0, False, rows.is_constant()
     if by.groups is not None:
         free = variances(table["signal"], at_bound, s_low, s_high)
         explained = (values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()) & ~still
         groups = [by.groups[fold.predicted] for fold in folds]
-        for o, own in enumerate(searches):
-            little = own.without_signal() - _GAIN
-            if own.loss(*found[o]) > little:
+        for o, search in enumerate(searches):
+            little = search.without_signal() - _GAIN
+            if search.loss(*best_of[o]) > little:
                 # All of the signal does not hold for held-out groups. A part of it may.
-                own = replace(own, signal=free[o])
-                found[o] = own.best()
-                gone += int(explained[o] and own.loss(*found[o]) > little)
-            factor = own.in_doubt(*found[o], groups)
-            found[o] = own.signal.clip(factor * found[o][0]), own.noise.clip(factor * found[o][1])
+                search = replace(search, signal=free[o])
+                best_of[o] = search.best()
+                gone += int(explained[o] and search.loss(*best_of[o]) > little)
+            factor = search.in_doubt(*best_of[o], groups)
+            best_of[o] = search.signal.clip(factor * best_of[o][0]), search.noise.clip(factor * best_of[o][1])
     elif table["noise"].free.any() and len(rows) >= _FEWEST_DEPENDENT:
         fixed = [Variance(value, value, value) for value in at_bound.tolist()]
         others = variances(table["noise"], values["noise"], np.maximum(low, np.minimum(left_over, high)), high)
         in_blocks = folds_in_order(rows.user_order(), by.n_folds, rng)
         blocks = _searches(model, values, in_blocks, rows, fixed, others)
-        random = [replace(own, signal=s2, noise=n2) for own, s2, n2 in zip(searches, fixed, others, strict=True)]
-        dependent = _dependent(rows, searches, found, blocks, random)
+        random = [replace(search, signal=s2, noise=n2) for search, s2, n2 in zip(searches, fixed, others, strict=True)]
+        dependent = _dependent(rows, searches, best_of, blocks, random)
     # Held-out rows of an output that does not vary say nothing about its variances.
     at_start = np.column_stack([at_bound, values["noise"]])
-    signal, noise = np.where(still[:, np.newaxis], at_start, found).T
-    return Calibrated(signal, noise, gone, dependent)
+    signal, noise = np.where(still[:, np.newaxis], at_start, best_of).T
+    return Calibration(signal, noise, gone, dependent)
 
 
 def _dependent(
     rows: Rows,
     searches: list[VarianceSearch],
-    found: list[tuple[float, float]],
+    best_of: list[tuple[float, float]],
     blocks: list[VarianceSearch],
     random: list[VarianceSearch],
 ) -> bool:
     """Whether blocks of consecutive rows are predicted worse than random folds: neighbouring rows are then alike."""
-    worse = [block.loss(*best) - own.loss(*best) for block, own, best in zip(blocks, searches, found, strict=True)]
+    worse = [
+        block.loss(*best) - search.loss(*best) for block, search, best in zip(blocks, searches, best_of, strict=True)
+    ]
     if max(worse) > _WORSE and follow_a_path(rows.user_order(), lambda some: rows.some(some).inputs):
         return True
     by_blocks, by_chance = (
-        np.array([noise for _, noise in rows.threads(VarianceSearch.best, own)]) for own in (blocks, random)
+        np.array([noise for _, noise in rows.threads(VarianceSearch.best, of_kind)]) for of_kind in (blocks, random)
     )
     return bool((by_blocks > _DEPENDENT * by_chance).any())
 
 
 def _left_over(model: SparseModel, values: Values, statistics: list[SufficientStatistics]) -> np.ndarray:
     """Squared error (o,) on the training rows, per degree of freedom."""
-    found = np.empty(len(values["noise"]))
+    squared_error = np.empty(len(values["noise"]))
     for bound in bounds_at_optimum(model.groups_of(values, statistics)):
         group = bound.group
         n_rows = group.statistics.n_rows
@@ -174,10 +176,10 @@ def _left_over(model: SparseModel, values: Values, statistics: list[SufficientSt
         if group.prior.shared:
             # Other outputs determine the weights too. What this output adds is the trace of σ⁻² PᵀP B⁻¹.
             for o, q in enumerate(bound.posteriors):
-                own = q.root_inv @ group.products(o)[0] @ q.root_inv.T
-                freedom[o] = n_rows - own.trace() / group.noise[o]
-        found[group.outputs] = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
-    return found
+                determined = q.root_inv @ group.products(o)[0] @ q.root_inv.T
+                freedom[o] = n_rows - determined.trace() / group.noise[o]
+        squared_error[group.outputs] = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
+    return squared_error
 
 
 def _searches(
@@ -192,16 +194,18 @@ def _searches(
     m, share = values["inducing_points"].shape[1], 1.0 / len(folds)
     all_of = [model.blocks(rows.subset(fold.rows, share), m) for fold in folds]
     predicted = [model.blocks(rows.subset(fold.predicted, share), m) for fold in folds]
-    each = []
+    left_out = []
     for outputs, whitening in zip(model.groups, model.whitenings(values), strict=True):
         of_others = sums_of_others([collect(fold, whitening, outputs) for fold in all_of])
         seen = [fold.sum(Seen(whitening, outputs)) for fold in predicted]
         groups = [model.group(values, outputs, whitening, others) for others in of_others]
-        each.append([LeftOut(group, model.variant.family, own) for group, own in zip(groups, seen, strict=True)])
+        left_out.append(
+            [LeftOut(group, model.variant.family, rows_of) for group, rows_of in zip(groups, seen, strict=True)]
+        )
     known: list[list[Weights | None]] = [[None] * len(folds)] * len(values["noise"])
     if model.prior.shared:
-        known = _known_elsewhere(each)
-    outputs_of = [(group, index) for group in each for index in range(len(group[0].group.noise))]
+        known = _known_elsewhere(left_out)
+    outputs_of = [(group, index) for group in left_out for index in range(len(group[0].group.noise))]
     return [
         VarianceSearch(index, group, of_weights, signal, noise)
         for (group, index), of_weights, signal, noise in zip(outputs_of, known, signals, noises, strict=True)
@@ -211,15 +215,15 @@ def _searches(
 def _known_elsewhere(groups: Sequence[Sequence[LeftOut]]) -> list[list[Weights | None]]:
     """For each output and fold, the knowledge of the weights from their prior and the other outputs as fitted."""
     outputs = [(group, index) for group in groups for index in range(len(group[0].group.noise))]
-    told = [[fold.says(index) for fold in group] for group, index in outputs]
-    found: list[list[Weights | None]] = []
+    says = [[fold.says(index) for fold in group] for group, index in outputs]
+    known: list[list[Weights | None]] = []
     for o, (group, index) in enumerate(outputs):
-        own: list[Weights | None] = []
+        of_output: list[Weights | None] = []
         for k, fold in enumerate(group):
-            others = (each[k] for j, each in enumerate(told) if j != o)
-            own.append(sum(others, start=prior_of(fold.group, index)))
-        found.append(own)
-    return found
+            others = (by_fold[k] for j, by_fold in enumerate(says) if j != o)
+            of_output.append(sum(others, start=prior_of(fold.group, index)))
+        known.append(of_output)
+    return known
 
 
 # --- the search for the signal and noise variances of an output -------------------------------------------------------
@@ -321,10 +325,10 @@ class VarianceSearch:
         # The root mean square of a group's errors over std is one observation of the scale of std. Their mean leaves
         # ν = 1 / (2 variance) degrees of freedom. Errors of a new group then follow Student's t distribution.
         means: list[np.ndarray] = []
-        for fold, known, own in zip(self.folds, self.known, groups, strict=True):
+        for fold, known, labels in zip(self.folds, self.known, groups, strict=True):
             error, variance = fold.predicted(self.index, signal / noise, np.array([noise]), known)
-            counts = np.bincount(own, fold.rows.counts)
-            sums = np.bincount(own, fold.rows.counts * (error**2 / variance)[:, 0])
+            counts = np.bincount(labels, fold.rows.counts)
+            sums = np.bincount(labels, fold.rows.counts * (error**2 / variance)[:, 0])
             means.append(sums[counts > 0.0] / counts[counts > 0.0])
         scale = np.sqrt(np.concatenate(means))
         spread = float(np.var(scale, ddof=1)) / max(float(np.mean(scale)) ** 2, _LOWEST)

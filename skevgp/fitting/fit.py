@@ -11,7 +11,7 @@ from ..model.parameters import Values, log_prior
 from ..model.posterior import SparsePosterior
 from ..model.statistics import SufficientStatistics
 from ..utils.monitor import Monitor
-from .calibration import Calibrated, calibrated
+from .calibration import Calibration, calibrate
 from .doubts import RowDoubts
 from .fitted import Fitted, FittedModel
 from .folds import CrossValidation
@@ -40,9 +40,9 @@ def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, pr
     threads = BlockMap(problem.n_threads if len(parts) == 1 else 1)
     try:
         models = models_of(problem, rng, monitor, threads, previous)
-        # Each model has a share of the time that is left when it starts.
-        turns = [(model, 1.0 / -(-(len(models) - i) // at_once)) for i, model in enumerate(models)]
-        fitted = side_by_side(_fit_one, turns, at_once, monitor)
+        # Each model has a share of the time that is left when it starts: one of the rounds that are left.
+        rounds = [-(-n_left // at_once) for n_left in range(len(models), 0, -1)]
+        fitted = side_by_side(_fit_one, [*zip(models, rounds, strict=True)], at_once, monitor)
     finally:
         threads.close()
     messages = sorted({model.message for model in fitted if model.message})
@@ -52,11 +52,11 @@ def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, pr
     return Fitted(problem.units, problem.sharing_found, tuple(fitted), tuple(messages))
 
 
-def _fit_one(turn: tuple[Model, float]) -> FittedModel:
-    """Fit one model, given the share of the remaining time that it has."""
-    model, share = turn
+def _fit_one(turn: tuple[Model, int]) -> FittedModel:
+    """Fit one model, given the number of rounds that share the remaining time."""
+    model, rounds = turn
     # The copy owns the blocks of rows, so that they are freed after the fit.
-    model = replace(model, monitor=model.monitor.with_time(share))
+    model = replace(model, monitor=model.monitor.with_time(1.0 / rounds))
     if not model.problem.noise.heavy_tails:
         return finished(*_best(model))
     model, fit, doubts = fit_doubting(model, _best)
@@ -77,7 +77,7 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
         if model.problem.noise_cv is not None:
             statistics = model.sparse.statistics(values, model.blocks)
             with model.monitor.keeping_the_best():
-                calibration = _calibrated(model, values, statistics, model.problem.noise_cv, doubts)
+                calibration = _calibration(model, values, statistics, model.problem.noise_cv, doubts)
     dependent, gone = calibration is not None and calibration.dependent, 0
     # Folds without groups correct the error of the inducing points. The exact model has none.
     if calibration is not None and (model.exact is None or model.problem.groups is not None):
@@ -96,13 +96,13 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
 
 
-def _calibrated(
+def _calibration(
     model: Model,
     values: Values,
     statistics: list[SufficientStatistics],
     folds: CrossValidation,
     doubts: RowDoubts | None,
-) -> Calibrated | None:
+) -> Calibration | None:
     """Signal and noise that predict held-out rows best. Outliers do not count."""
     rows = model.rows
     if model.exact is not None:
@@ -111,4 +111,4 @@ def _calibrated(
     if doubts is not None and doubts.rejected is not None:
         rows = doubts.without_outliers(rows)
         statistics = model.sparse.statistics(values, model.sparse.blocks(rows, model.n_inducing))
-    return calibrated(model.sparse, values, statistics, model.table, rows, folds, model.seed)
+    return calibrate(model.sparse, values, statistics, model.table, rows, folds, model.seed)

@@ -9,7 +9,7 @@ import numpy as np
 from ..data.rows import Rows, Source
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values
-from ..model.posterior import AnyPosterior, SparsePosterior
+from ..model.posterior import FittedPosterior, SparsePosterior
 from ..model.predictor import CoefficientPrior, Predictor
 from ..model.statistics import Kernel
 from ..model.weights import WeightLikelihood
@@ -24,7 +24,7 @@ class FittedModel:
 
     # Columns of y.
     outputs: list[int]
-    posterior: AnyPosterior
+    posterior: FittedPosterior
     # The limits and the start of the parameters.
     table: ParameterTable
     loss_curve: list[float]
@@ -67,6 +67,7 @@ class FittedModel:
         ``weight`` multiplies the log likelihood of the earlier rows. It must be 1 for noise with heavy tails.
         """
         if self.doubts is not None:
+            assert weight == 1.0
             return self._updated_doubting(self.doubts, rows)
         lowest = np.where(self.table["noise"].free, Rules.lowest_noise, 0.0)
         return replace(self, posterior=self.posterior.updated(rows, weight, lowest))

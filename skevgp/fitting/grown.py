@@ -29,8 +29,8 @@ def grown(model: Model) -> tuple[Model, Fit]:
     Half as many points again are added, the rows that are predicted worst so far, and the fit continues for a few
     iterations. This ends when it raises the bound by less than `_GAIN`. Then the last fit but one continues to its end.
     """
-    # Only the last fit has `max_iter` iterations. If there were too few between, points would be credited with the gain
-    # of further iterations.
+    # Only the last fit has `max_iter` iterations. Those of earlier fits are added to `n_iter_`. If there were too few
+    # between, points would be credited with the gain of further iterations.
     #
     # With few points, the noise may explain so much that half as many again change nothing. The kernel of an exact
     # model of a sample is a second opinion. While it makes the sample more likely than the kernel of the fit does, by
@@ -45,9 +45,7 @@ def grown(model: Model) -> tuple[Model, Fit]:
             starts, limited = [fit.values | {"inducing_points": more.table["inducing_points"].start}], False
             if unhindered is not None and unhindered.missed_by(fit.values) > _MISSED:
                 starts, limited = [*starts, more.placed_under(unhindered.fit.values)], True
-            # The bound at each start, without any iteration.
-            start = max((more.minimise(Start(values, 0)) for values in starts), key=lambda tried: tried.bound)
-            larger = more.minimise(Start(start.values, coarse.max_iter))
+            larger = more.minimise(Start(max(starts, key=more.bound_at), coarse.max_iter))
             if larger.bound - fit.bound < _GAIN * nats and not limited:
                 break
             coarse, fit = more, larger

@@ -109,7 +109,7 @@ def distinct_rows(inputs: np.ndarray) -> np.ndarray:
     return inputs[np.sort(first)]
 
 
-def with_more(
+def with_more_points(
     points: np.ndarray, n_inducing: int, inputs: np.ndarray, kernel: Kernel, hyperparameters: np.ndarray
 ) -> np.ndarray:
     """Inducing points (m, d), followed by the rows that they predict worst, at most ``n_inducing`` in all.

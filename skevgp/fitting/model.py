@@ -16,13 +16,13 @@ from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
-from ..model.posterior import AnyPosterior, ExactPosterior, SparsePosterior
+from ..model.posterior import ExactPosterior, FittedPosterior, SparsePosterior
 from ..model.statistics import SufficientStatistics
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .alone import best_by_likelihood, best_by_sums, features_alone, noise_left_over
-from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
+from .inducing import Placement, distinct_rows, greedy_sample_size, with_more_points
 from .messages import ended_early, far_from_prior, learned_too_little, mini_batches_ended
 from .problem import Problem
 from .rules import Rules
@@ -65,7 +65,7 @@ class Model:
 
     @cached_property
     def rng(self) -> np.random.RandomState:
-        """The only source of randomness of the fit."""
+        """The only source of randomness of the fit. A model that `replace` returns draws the same numbers again."""
         return np.random.RandomState(self.seed)
 
     # --- the rows -----------------------------------------------------------------------------------------------------
@@ -140,7 +140,17 @@ class Model:
             return LikelihoodObjective(self.exact, table)
         return BoundObjective(self.sparse, table, self.blocks)
 
-    def posterior(self, values: Values, statistics: list[SufficientStatistics] | None = None) -> AnyPosterior:
+    def bound_at(self, values: Values, n_rows: int | None = None) -> float:
+        """The bound at some values, of a sample of ``n_rows`` rows or of all. -inf if it cannot be computed."""
+        table = self.table.started_at(values)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                loss, _ = self.objective(table, n_rows)(table.start())
+        except NotPositiveDefiniteError:
+            return -np.inf
+        return float(-self.rows.total * loss) if np.isfinite(loss) else -np.inf
+
+    def posterior(self, values: Values, statistics: list[SufficientStatistics] | None = None) -> FittedPosterior:
         """The posterior at some values. The ``statistics`` of all rows at these are computed if they are None."""
         if self.exact is not None:
             # Fewer points than rows make predictions cheaper. The jitter of k(X_m, X_m) would show in a small std.
@@ -202,7 +212,7 @@ class Model:
             inputs = of_outputs(sample.inputs, outputs)
             sets.append(placement.points(inputs, kernel, hyperparameters, self.rng))
         m = min(map(len, sets))
-        points = np.array([own[:m] for own in sets])
+        points = np.array([points[:m] for points in sets])
         return values | {"inducing_points": np.repeat(points, len(self.sparse.groups) // len(points), axis=0)}
 
     def placed_under(self, values: Values) -> Values:
@@ -225,11 +235,11 @@ class Model:
                 sets.append(distinct)
             else:
                 everything = False
-                sets.append(with_more(points, wanted, inputs, kernel, hyperparameters))
+                sets.append(with_more_points(points, wanted, inputs, kernel, hyperparameters))
         n_inducing = min(map(len, sets))
         if n_inducing <= self.n_inducing:
             return None
-        table = self.table.changed("inducing_points", start=np.array([own[:n_inducing] for own in sets]))
+        table = self.table.changed("inducing_points", start=np.array([points[:n_inducing] for points in sets]))
         if everything and self.sparse.variant.family == "full":
             # The bound is then the likelihood, and no other points are better.
             table = table.changed("inducing_points", fixed=True)
@@ -343,4 +353,4 @@ class Model:
             kernel, hyperparameters = sparse.kernel_of(values, group)
             of_group = {"hyperparameters": hyperparameters, "noise": values["noise"][outputs]}
             messages.append(learned_too_little(kernel, of_group, self.table, self.rows.outputs(outputs), has_points))
-        return max(messages)
+        return " ".join(dict.fromkeys(filter(None, messages)))

@@ -51,16 +51,16 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
                 break
             until = min(fit.n_iter + _BETWEEN, model.max_iter)
             others = replace(weighed, rows=doubts.without_outliers(weighed.rows))
-            bound = others.minimise(Start(fit.values, 0)).bound
+            bound = others.bound_at(fit.values)
             fit = better(replace(fit, bound=bound), others.minimise(Start(fit.values, until, fit)))
             if fit.bound - bound < _PATIENCE * _tolerance(others, fit):
                 fit = replace(fit, converged=True, message="")
-    # After Ctrl-C, scales are those of an earlier fit. No iteration: only the bound is computed.
+    # After Ctrl-C, scales are those of an earlier fit.
     weighed = replace(weighed, rows=doubts.weigh(rows))
     if len(rows) >= _FEWEST_ROWS:
         look, std = look_at(rows, predictor_at(weighed, fit.values)), np.sqrt(fit.values["noise"])
         doubts = replace(doubts, far=float(look.far_from_median(FAR, _SHARE_OF_NOISE * std).mean()))
-    return weighed, replace(fit, bound=weighed.minimise(Start(fit.values, 0)).bound), doubts
+    return weighed, replace(fit, bound=weighed.bound_at(fit.values)), doubts
 
 
 def _first_doubts(model: Model) -> RowDoubts:
@@ -140,8 +140,7 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
         model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break
-    # No iteration: only the bound is computed.
-    return model, replace(fit, bound=model.minimise(Start(fit.values, 0)).bound), doubts
+    return model, replace(fit, bound=model.bound_at(fit.values)), doubts
 
 
 def _tolerance(model: Model, fit: Fit) -> float:

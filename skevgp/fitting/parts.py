@@ -114,8 +114,8 @@ class _Common:
     # One for all outputs, or one for each output with inputs of its own: the kernel with its centre, and the points.
     kernels: tuple[Covariance, ...]
     points: list[np.ndarray]
-    # The mean of k̃(x, x) at the start.
-    variance: float
+    # The mean of k̃(x, x) under each kernel at the start.
+    variances: np.ndarray
     # All models have the same seed: outputs that share nothing are then fitted as if each was alone.
     seed: int
     n_models: int
@@ -133,10 +133,11 @@ class _Common:
             table = starting_table(problem, rows.outputs([output]), np.empty((1, 0, inputs.shape[1])))
             hyperparameters = table.values_at_start()["hyperparameters"]
             points.append(problem.placement.points(inputs, kernel, hyperparameters, rng))
-        given, variance = problem.spec.starts.hyperparameters.value, 1.0
+        given, variances = problem.spec.starts.hyperparameters.value, np.ones(len(kernels))
         if given is not None:
-            some = np.unique(np.linspace(0, len(points[0]) - 1, _CHECKED_POINTS).astype(int))
-            variance = checked_variance(kernels[0], given, points[0][some])
+            for index, (kernel, candidates) in enumerate(zip(kernels, points, strict=True)):
+                some = np.unique(np.linspace(0, len(candidates) - 1, _CHECKED_POINTS).astype(int))
+                variances[index] = checked_variance(kernel, given, candidates[some])
         return cls(
             problem=problem,
             all_rows=problem.units.rows(problem.source, threads),
@@ -144,7 +145,7 @@ class _Common:
             sample=sample,
             kernels=kernels,
             points=points,
-            variance=variance,
+            variances=variances,
             seed=rng.randint(np.iinfo(np.int32).max),
             n_models=n_models,
         )
@@ -160,7 +161,8 @@ class _Common:
         complete = self._is_complete(start, part)
         exact = complete and not part.separate and problem.may_be_exact
         n_kernels = len(start) if part.separate else None
-        table = starting_table(problem, self.rows.outputs(outputs), start, self.variance, n_kernels, exact)
+        variances = self.variances[np.array(outputs) % len(self.variances)]
+        table = starting_table(problem, self.rows.outputs(outputs), start, variances, n_kernels, exact)
         if complete:
             table = table.changed("inducing_points", fixed=True)
         if problem.solver.takes_widest_limits:

@@ -17,7 +17,7 @@ from ..model.bounds import Variant
 from ..model.predictor import CoefficientPrior
 from ..noise import Gaussian
 from ..noise.base import Noise
-from ..solvers import LBFGS
+from ..solvers import LBFGS, solvers_of_all_rows
 from ..solvers.base import Solver
 from ..utils.validation import check_magnitude, check_not_vanishing
 from .folds import CrossValidation
@@ -183,21 +183,20 @@ class Problem:
         solver, prior = self.solver, self.units.prior
         if solver.stochastic and self.per_output and isinstance(self.sharing, str) and self.sharing == "kernel":
             raise ValueError(
-                'sharing="kernel" of outputs with rows of their own needs solver="lbfgs" or an LBFGS(...); got '
+                f'sharing="kernel" of outputs with rows of their own needs {solvers_of_all_rows()}; got '
                 f"solver={solver!r}."
             )
         if self.variant.orthogonal and (solver.stochastic or self.variant.family == "diagonal"):
             raise ValueError(
-                'discrepancy="orthogonal" needs solver="lbfgs" or an LBFGS(...) with posterior="full"; got '
-                f"solver={solver!r}."
+                f'discrepancy="orthogonal" needs {solvers_of_all_rows()} with posterior="full"; got solver={solver!r}.'
             )
-        told = "shared=True of CoefPrior" if prior.shared else "a covariance of the weights (cov of CoefPrior)"
+        asked = "shared=True of CoefPrior" if prior.shared else "a covariance of the weights (cov of CoefPrior)"
         if prior.root is None and not prior.shared:
             return
         if solver.stochastic:
-            raise ValueError(f'{told} needs solver="lbfgs" or an LBFGS(...); got solver={solver!r}.')
+            raise ValueError(f"{asked} needs {solvers_of_all_rows()}; got solver={solver!r}.")
         if self.variant.family == "diagonal":
-            raise ValueError(f'{told} needs posterior="full"; got posterior={self.variant.family!r}.')
+            raise ValueError(f'{asked} needs posterior="full"; got posterior={self.variant.family!r}.')
 
 
 def _prior(
@@ -216,8 +215,8 @@ def _prior(
 
     def left_over(mean: np.ndarray) -> np.ndarray:
         squares = np.sum(rows.left_over(np.broadcast_to(mean, (o, mean.shape[1]))) ** 2, axis=1)
-        found = np.sqrt(squares / targets.n)
-        return np.where(found > 0.0, found, np.where(targets.largest > 0.0, targets.largest, 1.0))
+        size = np.sqrt(squares / targets.n)
+        return np.where(size > 0.0, size, np.where(targets.largest > 0.0, targets.largest, 1.0))
 
     few = data.source.n_rows * (o if shared else 1) < _ENOUGH * features.mean.shape[-1]
 
@@ -231,8 +230,8 @@ def _prior(
         return wide_scale(R, targets.n, y, shared, moderate)
 
     shape = 1 if shared else o, features.mean.shape[-1]
-    found = resolved(asked, feature_map, data.given, InData(shape, wide, size, left_over), o, allow_vague)
-    mean, scale, root, groups = found.mean, found.scale, found.root, found.groups
+    coefficients = resolved(asked, feature_map, data.given, InData(shape, wide, size, left_over), o, allow_vague)
+    mean, scale, root, groups = coefficients.mean, coefficients.scale, coefficients.root, coefficients.groups
     if shared:
         mean, scale, groups = (np.repeat(values, o, axis=0) for values in (mean, scale, groups))
         root = None if root is None else np.repeat(root, o, axis=0)

@@ -32,12 +32,12 @@ def search(model: Model) -> Fit:
 
     Raises KeyboardInterrupt if there is none yet.
     """
-    found = Search(model)
+    fits = Search(model)
     with model.monitor.keeping_the_best(patient=True), suppress(_StoppedError):
-        found.run()
-    if found.best is None:
+        fits.run()
+    if fits.best is None:
         raise KeyboardInterrupt
-    return found.best
+    return fits.best
 
 
 class Search:
@@ -115,13 +115,13 @@ class Search:
         columns = np.flatnonzero(long.any(axis=tuple(range(long.ndim - 1))))
         if len(columns) == 0:
             return values
-        bound = self.model.minimise(Start(values, 0, n_rows=n_rows, cold=True)).bound
+        bound = self.model.bound_at(values, n_rows)
         for column in columns:
-            own = long & (np.arange(long.shape[-1]) == column)
-            trial = values | {name: np.where(own, first[name], values[name])}
-            tried = self.model.minimise(Start(trial, 0, n_rows=n_rows, cold=True))
-            if tried.bound > bound + _SEEN:
-                values, bound = trial, tried.bound
+            tried = long & (np.arange(long.shape[-1]) == column)
+            trial = values | {name: np.where(tried, first[name], values[name])}
+            bound_of_trial = self.model.bound_at(trial, n_rows)
+            if bound_of_trial > bound + _SEEN:
+                values, bound = trial, bound_of_trial
         return values
 
     def _stages(self, values: Values, max_iter: int, n_rows: int | None = None) -> Fit:
@@ -155,14 +155,14 @@ class Search:
             return best
         starts = list(self.rules.other_starts)
         if much is not None:
-            start = Start(moved(values, 1.0, much), until, None, n_rows, cold=everything)
+            start = Start(multiplied(values, 1.0, much), until, None, n_rows, cold=everything)
             best = better(best, self._fit(start))
             if everything:
                 starts = [factors for factors in starts if factors != (1.0, much)]
         for factors in starts:
             if not self.collapsed(best):
                 break
-            start = Start(moved(values, *factors), until, None, n_rows, cold=True)
+            start = Start(multiplied(values, *factors), until, None, n_rows, cold=True)
             best = better(best, self._fit(start))
         return best
 
@@ -187,7 +187,7 @@ class Search:
         return maybe_below or self._below(best, hopeless=alone.hidden)
 
 
-def moved(values: Values, length_factor: float, noise_factor: float) -> Values:
+def multiplied(values: Values, length_factor: float, noise_factor: float) -> Values:
     """The same values with hyperparameters and noise multiplied by factors."""
     return values | {
         "hyperparameters": length_factor * values["hyperparameters"],

@@ -62,15 +62,15 @@ def starting_table(
     problem: Problem,
     rows: Rows,
     inducing_points: np.ndarray,
-    mean_variance: float = 1.0,
+    mean_variance: np.ndarray | float = 1.0,
     n_kernels: int | None = None,
     exact: bool = False,
 ) -> ParameterTable:
     """The parameters of a model of some outputs: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
     ``rows`` are those of the outputs. Inducing points are (g, m, d). ``mean_variance`` is the mean of k̃(x, x) at the
-    start. ``n_kernels`` is the number of kernels if groups of outputs have one each. ``exact`` allows the lower noise
-    of the exact model.
+    start, (o,) or of all. ``n_kernels`` is the number of kernels if groups of outputs have one each. ``exact`` allows
+    the lower noise of the exact model.
     """
     units, starts, rules = problem.units, problem.spec.starts, problem.rules
     if exact and rules.lowest_noise_exact is not None:
@@ -78,6 +78,7 @@ def starting_table(
     inputs, columns = rows.inputs, rows.columns
     precision, scatter = rows.mean_precision, rows.scatter()
     target_unit, constant, rounding = units.target_unit[columns], units.constant[columns], units.rounding[columns]
+    # Scatter is in units of σ². Limits in units of the variance of y are multiplied by the mean precision of the rows.
     o, scale = np.ones(len(target_unit)), inputs.scale
     # Outputs may have their own columns, and groups of outputs their own kernels.
     typical = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale

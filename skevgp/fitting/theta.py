@@ -26,6 +26,7 @@ from ..features.theta import Prior
 from ..maps.theta import LinearizedFeatures, Theta, theta_jacobian
 from ..model.predictor import CoefficientPrior, Predictor
 from ..model.weights import ThetaStep, likelihood_of_whitened, theta_step
+from ..solvers import solvers_of_all_rows
 from ..utils.monitor import Monitor
 from ..utils.validation import is_dask
 from .fitted import Fitted
@@ -467,7 +468,7 @@ def calibrate(
     solver, noise = problem.solver, problem.noise
     if solver.stochastic or problem.variant.family == "diagonal" or noise.heavy_tails or noise.inputs is not None:
         raise ValueError(
-            f'A feature map with parameters ({", ".join(theta.names)}) needs solver="lbfgs" or an LBFGS(...) with '
+            f"A feature map with parameters ({', '.join(theta.names)}) needs {solvers_of_all_rows()} with "
             f'posterior="full", and Gaussian noise of y only; got solver={solver!r} and noise={noise!r}.'
         )
     calibrator = _Calibrator(data, problem, theta)

@@ -57,13 +57,13 @@ def reads(kind: type, in_casadi: bool = True) -> Callable[[_R], _R]:
 
 def known_kernels() -> str:
     """List the supported kernels, for messages and documentation."""
-    names = ", ".join(kind.__name__ for kind in READERS)
+    names = ", ".join(sorted(kind.__name__ for kind in READERS))
     return f"{names}, sums and products of these, and a WhiteKernel as one of the terms of the outermost sum"
 
 
 def exported_kernels() -> str:
     """List the kernels that can be exported to CasADi, for messages."""
-    return f"These can be exported: {', '.join(_IN_CASADI)}, sums and products of these."
+    return f"These can be exported: {', '.join(sorted(_IN_CASADI))}, sums and products of these."
 
 
 def one_lengthscale(kernel: Any, n_columns: int) -> bool:

@@ -387,7 +387,9 @@ class StationaryAt(CovarianceAt):
 
     def mixed_slopes(self, prepared: np.ndarray) -> np.ndarray:
         if not self.profile.smooth:
-            raise ValueError("A function of a Matern kernel with nu up to 1 has no gradient.")
+            raise ValueError(
+                "A function of this kernel has no gradient. It is as rough as one of a Matern kernel with nu up to 1."
+            )
         slope = self.profile.derivatives(np.zeros(1), np.ones(1), self.parameters)[0]
         d = self.points.shape[1]
         return np.broadcast_to(np.diag(slope * self.lengthscales**-2.0), (prepared.shape[1], d, d))

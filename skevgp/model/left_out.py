@@ -128,7 +128,7 @@ class _AtRatio:
     eigenvalues: np.ndarray
     coordinates: np.ndarray
     # (p,): linear terms of w, from the output's own data in units of σ⁻², and from elsewhere.
-    told: np.ndarray
+    from_data: np.ndarray
     linear: np.ndarray
     # (m, p): U, where the precision is the diagonal one minus σ⁻² UᵀU.
     less: np.ndarray | None = None
@@ -137,7 +137,7 @@ class _AtRatio:
         """The part of w in mean and variance (n, g) of the rows, for noise variances (g,)."""
         eigenvalues = self.eigenvalues[:, np.newaxis]
         precision = eigenvalues + (1.0 - eigenvalues) * (fitted / noise)
-        linear = np.outer(self.told, 1.0 / noise) + self.linear[:, np.newaxis]
+        linear = np.outer(self.from_data, 1.0 / noise) + self.linear[:, np.newaxis]
         mean, variance = self.coordinates @ (linear / precision), self.coordinates**2 @ (1.0 / precision)
         if self.less is not None:
             for g in range(len(noise)):
@@ -183,8 +183,8 @@ class LeftOut:
         """The knowledge of w that the other folds give through an output as it was fitted."""
         noise = self.group.noise[output]
         factor = self._factor(float(self.group.signal[output] / noise))
-        told = self._times_root(output, self._told(output, factor))
-        return Weights(self._within_root(output, self._unexplained(factor)) / noise, told / noise)
+        from_data = self._times_root(output, self._from_data(output, factor))
+        return Weights(self._within_root(output, self._unexplained(factor)) / noise, from_data / noise)
 
     def predicted(
         self, output: int, ratio: float, noise: np.ndarray, known: Weights | None = None
@@ -199,8 +199,8 @@ class LeftOut:
         mean, of_weights = at.of_weights(noise, float(self.group.noise[output]))
         if self._is_diagonal:
             prior = 1.0 if known is None else np.diagonal(known.precision)[:, np.newaxis]
-            own = np.diagonal(self._within_root(output, self.group.statistics.HH))[:, np.newaxis]
-            of_weights = self._times_root(output, self.rows.features) ** 2 @ (1.0 / (prior + own / noise))
+            determined = np.diagonal(self._within_root(output, self.group.statistics.HH))[:, np.newaxis]
+            of_weights = self._times_root(output, self.rows.features) ** 2 @ (1.0 / (prior + determined / noise))
         return error - mean, variance + of_weights
 
     def _at(self, output: int, ratio: float, known: Weights | None) -> _AtRatio:
@@ -229,7 +229,7 @@ class LeftOut:
             variance,
             diagonal.eigenvalues,
             self._times_root(output, features) @ diagonal.basis.T,
-            diagonal.basis @ self._times_root(output, self._told(output, factor)),
+            diagonal.basis @ self._times_root(output, self._from_data(output, factor)),
             diagonal.basis @ (-prior.reference[output] if known is None else known.linear),
             less,
         )
@@ -251,7 +251,7 @@ class LeftOut:
         """M (p, p), with ``factor`` = ρ D⁻¹."""
         return self.group.statistics.HH - self._X.T @ (factor[:, np.newaxis] * self._X)
 
-    def _told(self, output: int, factor: np.ndarray) -> np.ndarray:
+    def _from_data(self, output: int, factor: np.ndarray) -> np.ndarray:
         """Hᵀr - ρ Xᵀ D⁻¹ t (p,) of an output."""
         return self.group.statistics.HR[:, output] - self._X.T @ (factor * self._T[:, output])
 

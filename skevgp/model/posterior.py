@@ -1,14 +1,10 @@
-"""The posterior at the end of a fit. `SparsePosterior` and `ExactPosterior` have the same methods.
-
-A new approximation is another class with these: ``sparse``, ``values``, ``bound``, ``upper_bound``, ``predictor``,
-``n_contrasts``, `weight_likelihoods`, `moved` and `updated`. It is added to `AnyPosterior`.
-"""
+"""The posterior at the end of a fit: `FittedPosterior` says what each approximation has."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,6 +16,49 @@ from .parameters import Values
 from .predictor import CoefficientPrior, Predictor
 from .statistics import SufficientStatistics, Whitening
 from .weights import WeightLikelihood
+
+
+class FittedPosterior(Protocol):
+    """An approximation of the posterior at the end of a fit. Another approximation is another class with these."""
+
+    @property
+    def sparse(self) -> SparseModel:
+        """The sparse model. For an exact one, all rows are its inducing points."""
+
+    @property
+    def values(self) -> Values:
+        """The parameters of the model."""
+
+    @property
+    def bound(self) -> float:
+        """Lower bound on the log marginal likelihood of the residuals, in nats, in internal units."""
+
+    @property
+    def upper_bound(self) -> float:
+        """Upper bound on the same."""
+
+    @property
+    def predictor(self) -> Predictor:
+        """The predictor of residuals, in internal units."""
+
+    @property
+    def n_contrasts(self) -> np.ndarray:
+        """Number of residuals (o,) whose density the bound is about."""
+
+    def weight_likelihoods(
+        self, prior: CoefficientPrior | None = None, rows: Rows | None = None
+    ) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output: under another prior, or for ``rows`` with other features."""
+
+    def moved(self, prior: CoefficientPrior, rows: Rows) -> FittedPosterior:
+        """The posterior for other features of the same rows, at the same values."""
+
+    def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> FittedPosterior:
+        """The posterior with new rows: q is at its optimum for all of them.
+
+        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is the lowest noise of a
+        sparse model, as a share of the scatter of the rows. Only an exact model may have less.
+        """
 
 
 class FromRows(NamedTuple):
@@ -65,11 +104,11 @@ class SparsePosterior:
         """The posterior with a q that is not at its optimum, and its bound."""
         return replace(self, from_rows=FromRows(bound, self.upper_bound, predictor))
 
-    # --- what every posterior has -------------------------------------------------------------------------------------
+    # --- as `FittedPosterior` says ------------------------------------------------------------------------------------
 
     @cached_property
     def bound(self) -> float:
-        """Lower bound on the log marginal likelihood of the residuals, in nats, in internal units."""
+        """Lower bound on the log marginal likelihood."""
         return self.sparse.bound(self.values, self.statistics) if self.from_rows is None else self.from_rows.bound
 
     @cached_property
@@ -107,11 +146,7 @@ class SparsePosterior:
         return SparsePosterior.of(sparse, self.values, self._blocks(sparse, rows))
 
     def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
-        """The posterior with new rows: q is at its optimum for all of them.
-
-        ``weight`` multiplies the log likelihood of the earlier rows. ``lowest_noise`` (o,) is the lowest noise of a
-        sparse model. Only an exact model may have less.
-        """
+        """The posterior with new rows."""
         # Points that were all rows before are not all rows now.
         sparse, before = replace(self.sparse, complete=False), self.statistics
         whitenings = self.known_whitenings
@@ -183,8 +218,9 @@ class ExactPosterior:
         return ExactPosterior.of(*self._with(prior, _all(rows)), self.values)
 
     def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
-        """The posterior of the sparse model with new rows, as of `SparsePosterior`."""
-        values = self.values | {"noise": np.maximum(self.values["noise"], lowest_noise)}
+        """The posterior of the sparse model with new rows."""
+        lowest = lowest_noise * Rows.in_internal_units(self.exact.rows).scatter()
+        values = self.values | {"noise": np.maximum(self.values["noise"], lowest)}
         blocks, whitenings = _blocks_of(self.sparse, self.exact, values), tuple(self.sparse.whitenings(values))
         statistics = self.sparse.statistics(values, blocks, whitenings)
         before = SparsePosterior(self.sparse, values, statistics, known_whitenings=whitenings)
@@ -197,9 +233,6 @@ class ExactPosterior:
         vague[:, : self.exact.vague.shape[1]] = self.exact.vague
         exact = replace(self.exact, prior=prior, vague=vague, rows=rows)
         return replace(self.sparse, prior=prior), exact
-
-
-AnyPosterior = SparsePosterior | ExactPosterior
 
 
 def _all(rows: Rows) -> RawRows:

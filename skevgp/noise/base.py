@@ -36,7 +36,7 @@ class RowScales(Protocol):
 
     @property
     def mean(self) -> np.ndarray:
-        """E[τ], (n,)."""
+        """E[τ], (n,): about 1 for rows without an error (d = 0), and finite for all."""
 
     @property
     def outlier(self) -> np.ndarray:

@@ -12,6 +12,12 @@ __all__ = ["LBFGS", "Adam"]
 SOLVERS: dict[str, type[Solver]] = {"lbfgs": LBFGS, "adam": Adam}
 
 
+def solvers_of_all_rows() -> str:
+    """The values of ``solver`` that see all rows at once, for messages."""
+    names = [f'solver="{name}" or {kind.__name__}(...)' for name, kind in SOLVERS.items() if not kind.stochastic]
+    return ", ".join(names)
+
+
 def as_solver(solver: Any) -> Solver:
     """Return the solver for ``solver=``, with checked options; ValueError or TypeError if it is not valid."""
     if isinstance(solver, str) and solver in SOLVERS:

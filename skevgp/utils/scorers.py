@@ -40,8 +40,7 @@ def make_std_scorer(score_func: Metric, *, greater_is_better: bool = True, **kwa
     """Make a scorer from a metric of the predicted mean and standard deviation.
 
     Pass the scorer as ``scoring`` to `cross_validate`, `GridSearchCV` or `permutation_importance`. For metrics of the
-    mean, use `sklearn.metrics.make_scorer`. The scorers `neg_nlpd`, `neg_crps` and `neg_calibration_error` are ready to
-    use.
+    mean, use `sklearn.metrics.make_scorer`. The scorers of `skevgp.metrics`, such as `neg_nlpd`, are ready to use.
 
     Parameters
     ----------

@@ -178,3 +178,11 @@ def test_command_has_valid_options(run_script, monkeypatch, script, options):
 @pytest.mark.parametrize("script", [path.relative_to(ROOT).as_posix() for path in SCRIPTS])
 def test_script_documents_its_command(script):
     assert f"python {script}" in (ROOT / script).read_text()
+
+
+def test_each_rule_of_a_fit_can_be_switched_off():
+    """The benchmark of the rules edits the code by its text, which must still be there."""
+    for rule in runpy.run_path(str(BENCHMARKS / "rules.py"))["RULES_OFF"].values():
+        for off in rule.off:
+            with off():
+                pass

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.calibration import VarianceSearch, calibrated, variances
+from skevgp.fitting.calibration import VarianceSearch, calibrate, variances
 from skevgp.fitting.folds import (
     CrossValidation,
     random_folds,
@@ -84,7 +84,7 @@ def test_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fix
 def calibrated_rows(model, rows, table, values, by, threads=None):
     rows = replace(rows_of(rows, np.arange(len(rows))), threads=threads or BlockMap())
     statistics = model.statistics(values, model.blocks(rows, 6))
-    return calibrated(model, values, statistics, table, rows, by, 0)
+    return calibrate(model, values, statistics, table, rows, by, 0)
 
 
 @pytest.mark.parametrize("groups", [None, np.repeat(np.arange(30), 10)])

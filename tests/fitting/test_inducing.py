@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from skevgp.fitting.inducing import Placement, are_all_rows, with_more
+from skevgp.fitting.inducing import Placement, are_all_rows, with_more_points
 from skevgp.kernels.stationary import SquaredExponential
 
 
@@ -57,7 +57,7 @@ def test_greedy_takes_the_row_of_largest_conditional_variance():
 
 
 def more(Z, n_inducing, X, lengthscale=1.5):
-    return with_more(Z, n_inducing, X, SquaredExponential(X.shape[1]), np.full(X.shape[1], lengthscale))
+    return with_more_points(Z, n_inducing, X, SquaredExponential(X.shape[1]), np.full(X.shape[1], lengthscale))
 
 
 def test_more_points_are_the_least_known_from_points_that_are_no_rows():
