@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skevgp.fitting.rules import Rules
-from skevgp.fitting.runs import FeaturesAlone, Fit, better
+from skevgp.fitting.runs import FeaturesAlone, Fit, Start, better
 from skevgp.fitting.search import search
 from skevgp.model.parameters import Parameter, ParameterTable
 from skevgp.utils.monitor import Monitor
@@ -69,7 +69,8 @@ def drive(model, *results, stop_after=None):
         curve = [0.0] * options.get("n_iter", start.until)
         return Fit(values, bound, curve, options.get("converged", True), n_rows=start.n_rows)
 
-    model.minimise = minimise
+    # Where a bound alone is asked for, it is recorded as a fit without iterations.
+    model.minimise, model.bound_at = minimise, lambda values, n_rows: minimise(Start(values, 0, n_rows=n_rows)).bound
     best = search(model)
     assert not results
     return made, best
