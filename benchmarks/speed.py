@@ -475,7 +475,7 @@ def folders(options: Any) -> dict[str, Path]:
 
 
 def checkout_cells(options: Any) -> list[Checkout]:
-    jobs, seeds, commits = options.jobs_of_checkout or [*JOBS, *(["ur10e"] if options.data else [])], range(3), {}
+    jobs, seeds, commits = options.jobs_of_checkout or [*JOBS, *(["ur10e"] if options.data else [])], options.seeds, {}
     if options.quick:
         jobs, seeds = ["pendulum"], range(1)
     for name, folder in folders(options).items():
@@ -529,7 +529,7 @@ PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables,
 
 
 def main() -> None:
-    parser = harness.argument_parser(__doc__, quick="seconds", in_processes=False)
+    parser = harness.argument_parser(__doc__, quick="seconds", seeds=3, in_processes=False)
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--peer-python", help="of latency: a Python that has GPflow and GPyTorch")
     parser.add_argument("--fits", nargs="+", choices=FITS, help="of million; default: all but the reference")
