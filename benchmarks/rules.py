@@ -1189,12 +1189,13 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS))
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--data", type=Path, default=DATA, help="a folder with a folder uci")
+    parser.add_argument("--output", type=Path, default=CSV, help="the CSV; default: in benchmarks/results")
     options = parser.parse_args()
     if options.table:
         with pd.option_context("display.width", 250, "display.max_rows", None, "display.max_columns", None):
-            print(table(pd.read_csv(CSV)).to_string(index=False))
+            print(table(pd.read_csv(options.output)).to_string(index=False))
         return
-    globals()["DATA"] = options.data
+    globals().update(DATA=options.data, CSV=options.output)
     run(options)
 
 
