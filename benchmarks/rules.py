@@ -24,6 +24,9 @@ These numbers of the code are no rules, and are not switched off:
   `calibration._MOST_ROWS`, `grown._SAMPLE`, `_ITERATIONS`, `model._GROWTH`, `sharing._SAMPLE`, `_POINTS`,
   `_FIRST_ITERATIONS`, `outliers._LOOK_ROWS`, `_LOOK_ITERATIONS`, `robust._NEIGHBOURS`, `_SAMPLE`, `messages._PAIRS`,
   `Descent.memory`, `Rules.growth`;
+* the local part (`local.py`): sizes of samples `_SPARSE_ROWS`, `_SAMPLES`, `_NEIGHBOURS`, `_ONE_FOLD`, starts
+  `_FACTORS`, `_LENGTH_FACTORS`, `_NOISE_FACTORS`, and tolerances `_ITERATIONS`, `_TOLERANCE`, `_ROUNDS`, `_GAIN`,
+  `_REACH`, `_CLOSE`;
 * refusals of input: `problem._LARGEST_SPREAD`, `start.checked_variance`;
 * numbers of a model: `student_t._NU`, `_WIDTH`, `_SHARE`;
 * Adam: `model._FLAT`, `_NATURAL_RATES`, and the constants of `solvers/adam`.

@@ -33,6 +33,7 @@ def run(script, *arguments, monkeypatch):
 EXAMPLE_RUNS = [
     ("sparse_gp", ["picture.png"], "EVGPRegressor"),
     ("tabular", [], "inducing points, for 1 output"),
+    ("many_rows", [], "nearest rows"),
     ("online", [], "forgetting factor"),
     ("learn_dynamics", ["--system", "pendulum"], "EVGP-IFG"),
     ("link_gravity", [], "shoulder_lift_joint"),

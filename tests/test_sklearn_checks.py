@@ -51,6 +51,7 @@ SPARSE = [
     EVGPRegressor(n_inducing="auto", solver=LBFGS(max_inducing=20)),
     EVGPRegressor(sharing="auto"),
     EVGPRegressor(noise="student-t"),
+    EVGPRegressor(n_inducing=5, n_neighbors=5),
 ]
 ESTIMATORS = [*SPARSE, EGPRegressor(), InverseDynamics(), QUICK_NETWORK, *RESIDUALS, *MAPS]
 

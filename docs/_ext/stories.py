@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).resolve().parents[1]
 # The name of a file, without "plot_".
 GROUPS = {
-    "Tables of numbers": ["sparse_gp", "tabular"],
+    "Tables of numbers": ["sparse_gp", "tabular", "many_rows"],
     "Dynamics of robots": ["learn_dynamics", "any_robot", "nominal_dynamics", "link_gravity", "calibrate_simulator"],
     "Prediction and control": ["rollout", "online", "swing_up", "crocoddyl"],
     "Arms and their torques": ["real_arm", "payload", "tracking"],

@@ -14,6 +14,7 @@ from ..model.predictor import Predictor, PredictorGroup
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted
 from .derivatives import MappedRows, chained, mapped
+from .near import NearGroup
 
 _NONE = np.empty((0, 0))
 # Two points are the same if they differ by rounding only: by at most this share of the largest.
@@ -89,7 +90,7 @@ class CompiledPredictor:
 
     def _freeze(self, predictor: Predictor) -> None:
         noise = predictor.noise if self.include_noise else np.zeros_like(predictor.noise)
-        groups = tuple(_Group.of(group, predictor.offset[group.outputs]) for group in predictor.groups)
+        groups = tuple(_group_of(group, predictor.offset[group.outputs]) for group in predictor.groups)
         self._state = (predictor, groups, noise)
 
     def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
@@ -152,7 +153,7 @@ class CompiledPredictor:
 
     def _said(
         self, state: _State, rows: np.ndarray, inputs: np.ndarray, features: np.ndarray, return_std: bool
-    ) -> tuple[list[_Moments], np.ndarray, Any]:
+    ) -> tuple[list[Any], np.ndarray, Any]:
         """Return the moments of each group at mapped rows, and mean and std (n, o) of all outputs; std may be None."""
         predictor, groups, noise = state
         found = [group.moments(inputs, features, return_std) for group in groups]
@@ -194,6 +195,11 @@ class _Moments(NamedTuple):
     prepared: Any  # the kernel's own form of the rows
     P: np.ndarray  # (m + p, n): [V; Hᵀ]
     deviation: Any  # (o, k, n): R P, or None
+
+
+def _group_of(group: PredictorGroup, offset: np.ndarray) -> _Group | NearGroup:
+    """Prepare a group with the offset (o, p) of its weights."""
+    return _Group.of(group, offset) if group.near is None else NearGroup(group, group.near, offset[0])
 
 
 @dataclass(frozen=True)
@@ -266,4 +272,4 @@ def _shaped(X: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> tuple[np.n
 
 
 # The numbers of all predictions: weights, prepared groups, and the noise of each output.
-_State = tuple[Predictor, tuple[_Group, ...], np.ndarray]
+_State = tuple[Predictor, tuple[Any, ...], np.ndarray]

@@ -7,7 +7,7 @@ evaluated only along a path, one row after the other.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import index as as_index
 from typing import Any
 
@@ -19,6 +19,7 @@ from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup, Projected
 from ..utils.shapes import like_y
 from .derivatives import MappedRows, chained, mapped
+from .near import NearPath
 
 # Largest numbers of floats in memory: in the derivatives of all waves, and in the paths that are followed together.
 _NUMBERS_OF_WAVES, _NUMBERS_OF_PATHS = 2**22, 2**24
@@ -261,9 +262,10 @@ class Paths:
     """n functions of ``n_steps`` steps: each step evaluates each function at one row."""
 
     def __init__(self, predictor: Predictor, n: int, n_steps: int, rng: np.random.RandomState):
-        self.predictor = predictor
+        # Groups with a local part condition their rows themselves.
+        self.predictor = replace(predictor, groups=tuple(replace(group, near=None) for group in predictor.groups))
         common = common_normals(predictor, n, rng)
-        self._groups = [_Path(group, n, n_steps, common, rng) for group in predictor.groups]
+        self._groups = [_path_of(group, n, n_steps, common, rng) for group in predictor.groups]
 
     def step(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Return the noise-free g(x) of each function at its row, (n, o), from inputs (n, d) and features (n, p)."""
@@ -271,6 +273,16 @@ class Paths:
         parts = [own.step(rows).T for own, rows in zip(self._groups, projected, strict=True)]
         values = self.predictor.in_order(parts).T
         return values + times_weights(features, self.predictor.offset) + self.predictor.intercept
+
+
+def _path_of(
+    group: PredictorGroup, n: int, n_steps: int, common: np.ndarray, rng: np.random.RandomState
+) -> _Path | NearPath:
+    """Draw the part of n functions that belongs to one group of outputs."""
+    if group.near is None:
+        return _Path(group, n, n_steps, common, rng)
+    weights = drawn_weights(group, n, common, rng)[:, 0]
+    return NearPath(group, group.near, n_steps, weights, rng.standard_normal((n, n_steps)))
 
 
 class _Path:

@@ -175,7 +175,7 @@ class Posterior:
         >>> jacobian.shape
         (1, 2, 3)
         """
-        fast = self.compile(include_noise)
+        fast = self._compiled(include_noise)
         parts = [fast.value_and_jacobian(rows, return_std) for rows in self._few(X)]
         return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
@@ -231,7 +231,8 @@ class Posterior:
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be requested.")
-        fast, maps = self.compile(), as_maps(self.maps)
+        self._check_smooth("predict_gradient")
+        fast, maps = self._compiled(), as_maps(self.maps)
         parts, covariances = [], []
         for rows in self._few(X):
             parts.append(fast.value_and_jacobian(rows)[1])
@@ -286,7 +287,16 @@ class Posterior:
         >>> slope.round(2)
         array([1.])
         """
+        self._check_smooth("compile")
+        return self._compiled(include_noise)
+
+    def _compiled(self, include_noise: bool = True) -> CompiledPredictor:
         return CompiledPredictor(self.predictor, *as_maps(self.maps), include_noise, self.base)
+
+    def _check_smooth(self, name: str) -> None:
+        """Raise a ValueError if the model has a local part, whose neighbours change from row to row."""
+        if any(group.near is not None for group in self.predictor.groups):
+            raise ValueError(f"{name} needs a smooth model of fixed size. Fit the model with n_neighbors=0.")
 
     def to_l4acados(self, columns: ArrayLike | None = None, *, include_noise: bool = True) -> L4acadosModel:
         """Make a residual model for the controllers of L4acados, which plan with acados.
@@ -327,6 +337,7 @@ class Posterior:
         >>> value.shape, jacobian.shape
         ((20, 1), (1, 20, 3))
         """
+        self._check_smooth("to_l4acados")
         return L4acadosModel(self.compile(include_noise), checked_columns(columns, self.maps.n_columns))
 
     def sample_functions(
@@ -376,6 +387,7 @@ class Posterior:
         ((5, 60), ())
         >>> value, slope = functions[0].value_and_jacobian(X)
         """
+        self._check_smooth("sample_functions")
         check_integer(n, "n", minimum=1)
         check_integer(n_waves, "n_waves", minimum=1)
         return FunctionSamples(self.functions(), n, n_waves, check_random_state(random_state))
@@ -510,6 +522,7 @@ class Posterior:
         return write_c(function, path, jacobian, self.maps.columns, include_noise)
 
     def _for_casadi(self) -> Exported:
+        self._check_smooth("An export to CasADi or C")
         maps = self.maps
         features, inputs = (None if each is None else as_map(each) for each in (maps.feature_map, maps.kernel_map))
         return Exported(self.predictor, features, inputs, maps.n_columns)

@@ -44,6 +44,22 @@ class RawRows:
         some: list[Any] = [None if values is None else values[rows] for values in vars(self).values()]
         return RawRows(*some)
 
+    def followed_by(self, other: RawRows) -> RawRows:
+        """These rows and others. If only one of both has weights, those of the other are 1."""
+        parts: list[RawRows] = [self, other]
+        if self.counts is not None or other.counts is not None:
+            parts = [part if part.counts is not None else part.with_unit_weights() for part in parts]
+        joined: list[Any] = [
+            None if any(values is None for values in pair) else np.concatenate(pair)
+            for pair in zip(*(vars(part).values() for part in parts), strict=True)
+        ]
+        return RawRows(*joined)
+
+    def with_unit_weights(self) -> RawRows:
+        """The same rows with weights and noise variances of 1."""
+        ones = np.ones(len(self.inputs))
+        return replace(self, counts=ones, precision=ones)
+
     @property
     def total(self) -> float:
         """Σ w."""

@@ -74,6 +74,9 @@ class EVGPRegressor(GaussianProcess):
     n_inducing : int or "auto", default=100
         Number of inducing points. If ``"auto"``, it grows while this raises the bound. See
         :doc:`/howto/inducing_points`.
+    n_neighbors : int, default=0
+        Number of training rows near a row on which the residual of the inducing points is conditioned. With 60, a model
+        of 5,000 rows or more is about as accurate as an exact Gaussian process. See :doc:`/guide/neighbors`.
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
         Start of the inducing points: cluster centres, rows of large residual variance (``"greedy"``), or points in the
         space of ``kernel_map``. If ``"auto"``, L-BFGS tries both.
@@ -137,9 +140,10 @@ class EVGPRegressor(GaussianProcess):
         ``noise="student-t"``.
     lower_bound_, upper_bound_ : float
         Bounds on the log marginal likelihood in nats, summed over outputs, for the fitted kernel and the calibrated
-        noise. If they agree, more inducing points do not help this kernel.
+        noise. If they agree, more inducing points do not help this kernel. With ``n_neighbors``, the first is the log
+        likelihood of the approximation, which is no bound, and the second is inf.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the lower bound per iteration.
+        Minus the lower bound per iteration. With ``n_neighbors``, that of the sparse fit which comes first.
     n_iter_ : int
         Number of iterations of the best start.
     n_parameters_ : int
@@ -186,6 +190,7 @@ class EVGPRegressor(GaussianProcess):
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "normalize_y": ["boolean"],
         "solver": "no_validation",
+        "n_neighbors": [Interval(Integral, 0, None, closed="left")],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
@@ -202,6 +207,7 @@ class EVGPRegressor(GaussianProcess):
         kernel_map: TransformerMixin | None = None,
         coef_prior: CoefPrior | Literal["auto"] = "auto",
         n_inducing: int | Literal["auto"] = 100,
+        n_neighbors: int = 0,
         inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Sharing = "auto",
         noise: str | Noise = "gaussian",
@@ -220,6 +226,7 @@ class EVGPRegressor(GaussianProcess):
         self.kernel_map = kernel_map
         self.coef_prior = coef_prior
         self.n_inducing = n_inducing
+        self.n_neighbors = n_neighbors
         self.inducing_init = inducing_init
         self.sharing = sharing
         self.noise = noise
@@ -381,6 +388,11 @@ class EVGPRegressor(GaussianProcess):
                 f"With noise={self.noise!r}, partial_fit needs rows in memory or in a file, and forgetting_factor=1; "
                 f"got forgetting_factor={forgetting_factor!r}."
             )
+        if self.n_neighbors and fading < 1.0:
+            raise ValueError(
+                f"With n_neighbors={self.n_neighbors}, partial_fit needs forgetting_factor=1; got "
+                f"forgetting_factor={forgetting_factor!r}."
+            )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             maps, fitted = self._posterior.maps, self._fitted
             data = Dataset.further(self, maps, X, y, sample_weight, relative_variance)
@@ -406,7 +418,10 @@ class EVGPRegressor(GaussianProcess):
 
     @property
     def lower_bound_(self) -> float:
-        """Lower bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
+        """Lower bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs.
+
+        With ``n_neighbors``, it is the log likelihood of the approximation, which is no bound.
+        """
         # After partial_fit it is computed when it is read.
         with single_threaded_libraries():
             return float(self._fitted.lower_bound) - self._counted_twice
@@ -426,12 +441,26 @@ class EVGPRegressor(GaussianProcess):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
         elif solver.stochastic:
             raise ValueError(f'n_inducing="auto" needs {solvers_of_all_rows()}; got solver={self.solver!r}.')
+        if check_integer(self.n_neighbors, "n_neighbors", minimum=0):
+            self._check_local(solver, noise, X)
         asked = f"noise={self.noise!r}" if noise.heavy_tails else "inputs of Gaussian noise"
         if (noise.heavy_tails or noise.inputs is not None) and (solver.stochastic or is_dask(X)):
             raise ValueError(
                 f"{asked} needs {solvers_of_all_rows()}, and rows in memory or in a file; got "
                 f"solver={self.solver!r} and X of type {type(X).__name__}."
             )
+
+    def _check_local(self, solver: Solver, noise: Noise, X: Any) -> None:
+        """Raise an error for arguments that a model with a local part does not support."""
+        unsupported = {
+            f"solver={self.solver!r}": solver.stochastic or solver.posterior != "full",
+            f"noise={self.noise!r}": noise.heavy_tails or noise.inputs is not None,
+            f"discrepancy={self.discrepancy!r}": self.discrepancy == "orthogonal",
+            f"X of type {type(X).__name__}": is_dask(X),
+        }
+        for name, refused in unsupported.items():
+            if refused:
+                raise ValueError(f"n_neighbors={self.n_neighbors} does not support {name}. Use n_neighbors=0.")
 
     def _problem(self, data: Dataset, solver: Solver, noise: Noise) -> Problem:
         prior = as_coef_prior(self.coef_prior)
@@ -442,7 +471,9 @@ class EVGPRegressor(GaussianProcess):
         problem = replace(
             problem,
             sharing=self.sharing,
-            variant=Variant(solver.posterior, solver.bound == "tight", self.discrepancy == "orthogonal"),
+            variant=Variant(
+                solver.posterior, solver.bound == "tight", self.discrepancy == "orthogonal", self.n_neighbors
+            ),
             placement=Placement.of(self.inducing_init, self.n_inducing, most, problem.n_columns),
             solver=solver,
             max_iter=solver.default_max_iter if self.max_iter is None else self.max_iter,

@@ -215,10 +215,15 @@ def of_gaussian_process(model: Any) -> ModelSummary:
     else:
         counts = {len(own) for own in points} if isinstance(points, list) else {points.shape[-2]}
         size = f"{' to '.join(dict.fromkeys(map(str, (min(counts), max(counts)))))} inducing points"
+    near = model._posterior.predictor.groups[0].near
+    certificate = _certificate(lower, upper)
+    if near is not None:
+        size += f" and {near.n_neighbors} neighbours"
+        certificate = f"log likelihood of the approximation: {lower:.2f} nats"
     outputs_text = f"{len(noise)} output{'s' if len(noise) > 1 else ''}"
     return ModelSummary(
         f"{type(model).__name__}, {size}, for {outputs_text}",
-        _certificate(lower, upper),
+        certificate,
         {output: str(kernel) for output, kernel in kernels.items()},
         tuple(numbers),
         lower,

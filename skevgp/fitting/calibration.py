@@ -322,18 +322,11 @@ class VarianceSearch:
 
     def in_doubt(self, signal: float, noise: float, groups: Sequence[np.ndarray]) -> float:
         """The factor by which variances grow because there are few groups. ``groups`` has labels (n,) for each fold."""
-        # The root mean square of a group's errors over std is one observation of the scale of std. Their mean leaves
-        # ν = 1 / (2 variance) degrees of freedom. Errors of a new group then follow Student's t distribution.
         means: list[np.ndarray] = []
         for fold, known, labels in zip(self.folds, self.known, groups, strict=True):
             error, variance = fold.predicted(self.index, signal / noise, np.array([noise]), known)
-            counts = np.bincount(labels, fold.rows.counts)
-            sums = np.bincount(labels, fold.rows.counts * (error**2 / variance)[:, 0])
-            means.append(sums[counts > 0.0] / counts[counts > 0.0])
-        scale = np.sqrt(np.concatenate(means))
-        spread = float(np.var(scale, ddof=1)) / max(float(np.mean(scale)) ** 2, _LOWEST)
-        degrees = max(len(scale) / max(2.0 * spread, 1e-6), _FEWEST_DEGREES)
-        return float((student_t.ppf(_INSIDE, degrees) / norm.ppf(_INSIDE)) ** 2)
+            means.append(means_of_groups((error**2 / variance)[:, 0], fold.rows.counts, labels))
+        return factor_in_doubt(np.concatenate(means))
 
     def _at_ratio(self, ratio: float) -> tuple[float, float]:
         """The lowest loss at a ratio s²/σ², and the noise variance there."""
@@ -381,3 +374,19 @@ class VarianceSearch:
             excess += counts @ scaled
             n += counts.sum()
         return density / n, squares / n, excess / n
+
+
+def means_of_groups(squares: np.ndarray, counts: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """The mean of squared errors over their variances (n,), weighted by counts (n,), of each group (by labels (n,))."""
+    totals, sums = np.bincount(labels, counts), np.bincount(labels, counts * squares)
+    return sums[totals > 0.0] / totals[totals > 0.0]
+
+
+def factor_in_doubt(means: np.ndarray) -> float:
+    """The factor by which variances grow because there are few groups, given the `means_of_groups`."""
+    # The root mean square of a group's errors over std is one observation of the scale of std. Their mean leaves
+    # ν = 1 / (2 variance) degrees of freedom. Errors of a new group then follow Student's t distribution.
+    scale = np.sqrt(means)
+    spread = float(np.var(scale, ddof=1)) / max(float(np.mean(scale)) ** 2, _LOWEST)
+    degrees = max(len(scale) / max(2.0 * spread, 1e-6), _FEWEST_DEGREES)
+    return float((student_t.ppf(_INSIDE, degrees) / norm.ppf(_INSIDE)) ** 2)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data.threads import BlockMap, side_by_side
 from ..model.parameters import Values, log_prior
-from ..model.posterior import SparsePosterior
+from ..model.posterior import LocalPosterior, SparsePosterior
 from ..model.statistics import SufficientStatistics
 from ..utils.monitor import Monitor
 from .calibration import Calibration, calibrate
@@ -16,6 +16,7 @@ from .doubts import RowDoubts
 from .fitted import Fitted, FittedModel
 from .folds import CrossValidation
 from .grown import grown
+from .local import calibrated_locally, local_model, with_local_part
 from .messages import interrupted, many_outliers, signal_gone
 from .model import Model
 from .outliers import fit_doubting
@@ -57,6 +58,8 @@ def _fit_one(turn: tuple[Model, int]) -> FittedModel:
     model, rounds = turn
     # The copy owns the blocks of rows, so that they are freed after the fit.
     model = replace(model, monitor=model.monitor.with_time(1.0 / rounds))
+    if model.problem.variant.n_neighbors:
+        return _with_local_part(model)
     if not model.problem.noise.heavy_tails:
         return finished(*_best(model))
     model, fit, doubts = fit_doubting(model, _best)
@@ -66,6 +69,24 @@ def _fit_one(turn: tuple[Model, int]) -> FittedModel:
 def _best(model: Model) -> tuple[Model, Fit]:
     """The best fit and its model. The model is another one if the number of inducing points was to be found."""
     return (model, search(model)) if model.problem.placement.max_inducing is None else grown(model)
+
+
+def _with_local_part(model: Model) -> FittedModel:
+    """Fit the sparse model, then signal, noise and kernel with the local part."""
+    model, fit, values = with_local_part(model, _best)
+    if model.exact is not None:
+        return finished(model, fit)
+    messages, folds, dependent = [fit.message, model.far_from_prior(fit.values)], model.problem.noise_cv, False
+    if folds is not None and model.max_iter > 0 and not model.monitor.stopped:
+        with model.monitor.keeping_the_best():
+            statistics = model.sparse.statistics(fit.values, model.blocks)
+            of_sparse = _calibration(model, fit.values, statistics, folds, None)
+            dependent = of_sparse is not None and of_sparse.dependent
+            values = calibrated_locally(model, values, folds)
+    values, _ = with_signal_of_constants(model.problem, model.rows, model.table, values)
+    posterior = LocalPosterior.of(model.sparse, values, local_model(model))
+    message = " ".join(part for part in messages if part)
+    return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent)
 
 
 def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedModel:

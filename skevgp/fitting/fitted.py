@@ -9,7 +9,7 @@ import numpy as np
 from ..data.rows import Rows, Source
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values
-from ..model.posterior import FittedPosterior, SparsePosterior
+from ..model.posterior import FittedPosterior, LocalPosterior, SparsePosterior
 from ..model.predictor import CoefficientPrior, Predictor
 from ..model.statistics import Kernel
 from ..model.weights import WeightLikelihood
@@ -132,7 +132,7 @@ class Fitted:
         units = self._with_prior(prior)
         internal, models = units.internal_prior(), []
         for model in self.models:
-            assert isinstance(model.posterior, SparsePosterior)
+            assert isinstance(model.posterior, SparsePosterior | LocalPosterior)
             models.append(replace(model, posterior=model.posterior.reweighted(internal.outputs(model.outputs))))
         return replace(self, units=units, models=tuple(models))
 

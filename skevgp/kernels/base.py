@@ -79,6 +79,10 @@ def one_lengthscale(kernel: Any, n_columns: int) -> bool:
 # --- sums over rows, and preparations of rows ----------------------------------------------------------------------
 
 
+# Maps symmetric gradients in k(X_b, X_b) (b, k, k) to that in the log hyperparameters (n_hyper,).
+SetsPullback = Callable[[np.ndarray], np.ndarray]
+
+
 class Sums(tuple[Any, ...]):
     """Several sums over rows (arrays, or `Sums` again); ``+`` adds them one by one."""
 
@@ -206,6 +210,28 @@ class Covariance(ABC):
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
         """Return the covariance at hyperparameters (n_hyper,) and inducing points (m, d)."""
 
+    def within(self, hyperparameters: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, SetsPullback]:
+        """Return k(X_b, X_b) (b, k, k) of small sets of rows (b, k, d), and the function that pulls gradients back.
+
+        A subclass may be faster than this loop over the sets.
+        """
+        parts = [self.at(hyperparameters, rows) for rows in sets]
+
+        def pull_back(bars: np.ndarray) -> np.ndarray:
+            total = np.zeros(self.n_hyperparameters)
+            for part, bar in zip(parts, bars, strict=True):
+                total += part.finish_pullback(part.start_pullback(), bar)[0]
+            return total
+
+        return np.array([part.matrix() for part in parts]), pull_back
+
+    def nearness(self, hyperparameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Return coordinates (n, k) of rows (n, d): the closer two rows are in these, the larger is their correlation.
+
+        There are none (k = 0) if the kernel has no distance.
+        """
+        return np.empty((len(inputs), 0))
+
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Any, ...]]:
@@ -256,6 +282,9 @@ class _Combination(Covariance):
     def centred(self, centre: np.ndarray) -> _Combination:
         return replace(self, parts=tuple(part.centred(centre) for part in self.parts))
 
+    def nearness(self, hyperparameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        return np.hstack([part.nearness(values, inputs) for part, values in self.pairs(hyperparameters)])
+
     def pairs(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
         """Yield each part with its hyperparameters."""
         ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
@@ -299,6 +328,14 @@ class Sum(_Combination):
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SumAt:
         return SumAt(self._parts_at(hyperparameters, inducing_points))
 
+    def within(self, hyperparameters: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, SetsPullback]:
+        values, pullbacks = zip(*(part.within(own, sets) for part, own in self.pairs(hyperparameters)), strict=True)
+
+        def pull_back(bars: np.ndarray) -> np.ndarray:
+            return np.concatenate([of_part(bars) for of_part in pullbacks])
+
+        return reduce(add, values), pull_back
+
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Any, ...]]:
@@ -318,6 +355,18 @@ class Product(_Combination):
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ProductAt:
         return ProductAt(self._parts_at(hyperparameters, inducing_points))
+
+    def within(self, hyperparameters: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, SetsPullback]:
+        values, pullbacks = zip(*(part.within(own, sets) for part, own in self.pairs(hyperparameters)), strict=True)
+
+        def pull_back(bars: np.ndarray) -> np.ndarray:
+            gradients = []
+            for index, of_part in enumerate(pullbacks):
+                others = reduce(mul, (value for other, value in enumerate(values) if other != index))
+                gradients.append(of_part(bars * others))
+            return np.concatenate(gradients)
+
+        return reduce(mul, values), pull_back
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState

@@ -111,6 +111,10 @@ class Wave(Covariance):
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> WaveAt:
         return WaveAt(self.frequencies(hyperparameters), self.rows.centred(inducing_points), self.isotropic)
 
+    def nearness(self, hyperparameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        phases = self.rows.centred(inputs) @ self.frequencies(hyperparameters)
+        return np.column_stack([np.cos(phases), np.sin(phases)])
+
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Waves]]:

@@ -35,6 +35,10 @@ class ExpSineSquared(Profile):
         slope *= (2.0 * np.pi / parameters[0]) ** 2
         return slope, [4.0 * self._squared(r, parameters) * value]
 
+    def nearness(self, scaled: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        # Each column is a circle, whose chords have the squares 4 sin²(π r).
+        return np.hstack([np.cos(2.0 * np.pi * scaled), np.sin(2.0 * np.pi * scaled)]) / parameters[0]
+
     @staticmethod
     def _squared(r: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return sin²(π r) / ℓ²."""

@@ -20,6 +20,7 @@ from .base import (
     Covariance,
     CovarianceAt,
     PerRow,
+    SetsPullback,
     Sums,
     exported_kernels,
     no_functions,
@@ -75,6 +76,10 @@ class Profile(ABC):
     @abstractmethod
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
         """Return φ'(E) and the derivative in the logarithm of each parameter, given φ(E)."""
+
+    def nearness(self, scaled: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return coordinates (n, k) in which near rows have a large φ, from rows (n, d) in length scales."""
+        return scaled
 
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
@@ -332,6 +337,39 @@ class Stationary(Covariance):
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
         points = self.rows.centred(inducing_points)
         return StationaryAt(self.profile, *self._split(hyperparameters), points, self.isotropic)
+
+    def within(self, hyperparameters: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, SetsPullback]:
+        parameters, lengthscales = self._split(hyperparameters)
+        # Around a row of each set, small differences keep their digits.
+        scaled = (sets - sets[:, -1:]) / lengthscales
+        if self.profile.smooth:
+            squares = -0.5 * np.einsum("bkd,bkd->bk", scaled, scaled)
+            E = scaled @ scaled.transpose(0, 2, 1)
+            E += squares[:, :, np.newaxis]
+            E += squares[:, np.newaxis]
+            np.minimum(E, 0.0, out=E)
+        else:
+            E = np.zeros((*scaled.shape[:2], scaled.shape[1]))
+            for column in np.moveaxis(scaled, 2, 0):
+                E -= 0.5 * np.square(column[:, :, np.newaxis] - column[:, np.newaxis])
+        value = self.profile.value(E, parameters)
+
+        def pull_back(bars: np.ndarray) -> np.ndarray:
+            slopes, others = self.profile.derivatives(E, value, parameters)
+            if not self.profile.smooth:
+                slopes = np.where(E == 0.0, 0.0, slopes)
+            # ∂E/∂log ℓ = ((x - x') / ℓ)², and the weights W of all pairs are symmetric.
+            W = bars * slopes
+            by_row = np.einsum("bkd,bkd,bk->d", scaled, scaled, W.sum(axis=2))
+            length_bar = 2.0 * (by_row - np.einsum("bkd,bkd->d", W @ scaled, scaled))
+            parameter_bar = [np.vdot(bars, other) for other in others]
+            return np.append(parameter_bar, length_bar.sum() if self.isotropic else length_bar)
+
+        return value, pull_back
+
+    def nearness(self, hyperparameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        parameters, lengthscales = self._split(hyperparameters)
+        return self.profile.nearness(self.rows.centred(inputs) / lengthscales, parameters)
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState

@@ -44,6 +44,8 @@ class Variant:
     tight: bool = False
     # Whether f is orthogonal to the features (see `Group.leaks`). Fits are those of the free f.
     orthogonal: bool = False
+    # Number of nearest rows on which the residual of the inducing points is conditioned (see `conditioning`).
+    n_neighbors: int = 0
 
     @property
     def of_fit(self) -> Variant:

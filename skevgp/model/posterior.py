@@ -10,7 +10,9 @@ import numpy as np
 
 from ..data.blocks import Blocks
 from ..data.rows import RawRows, Rows
+from .conditioning import KnownRows
 from .exact import ExactModel
+from .local import LocalModel, values_by_output
 from .model import SparseModel
 from .parameters import Values
 from .predictor import CoefficientPrior, Predictor
@@ -217,10 +219,14 @@ class ExactPosterior:
         """The posterior for other features of the same rows, at the same values."""
         return ExactPosterior.of(*self._with(prior, _all(rows)), self.values)
 
-    def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> SparsePosterior:
-        """The posterior of the sparse model with new rows."""
+    def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> FittedPosterior:
+        """The posterior of the sparse model with new rows, with its local part if it has one."""
         lowest = lowest_noise * Rows.in_internal_units(self.exact.rows).scatter()
         values = self.values | {"noise": np.maximum(self.values["noise"], lowest)}
+        n_neighbors, raw = self.sparse.variant.n_neighbors, self.exact.rows
+        if n_neighbors:
+            local = LocalModel.of(self.sparse, raw, n_neighbors, np.arange(len(raw.inputs)))
+            return LocalPosterior.of(self.sparse, values, local).updated(rows, weight, lowest_noise)
         blocks, whitenings = _blocks_of(self.sparse, self.exact, values), tuple(self.sparse.whitenings(values))
         statistics = self.sparse.statistics(values, blocks, whitenings)
         before = SparsePosterior(self.sparse, values, statistics, known_whitenings=whitenings)
@@ -233,6 +239,84 @@ class ExactPosterior:
         vague[:, : self.exact.vague.shape[1]] = self.exact.vague
         exact = replace(self.exact, prior=prior, vague=vague, rows=rows)
         return replace(self.sparse, prior=prior), exact
+
+
+@dataclass(frozen=True)
+class LocalPosterior:
+    """A model with a local part at the end of a fit, with its rows (see `conditioning`)."""
+
+    sparse: SparseModel
+    values: Values
+    local: LocalModel
+    # The sparse model of the differences between rows and their neighbours. Each output has its inducing points.
+    of_differences: SparsePosterior
+
+    @classmethod
+    def of(cls, sparse: SparseModel, values: Values, local: LocalModel) -> LocalPosterior:
+        """The posterior at some values."""
+        by_output = values_by_output(sparse, values)
+        known = local.known(by_output)
+        statistics = local.statistics(by_output, known, local.neighbours(known))
+        whitenings = tuple(rows.whitening for rows in known)
+        of_differences = SparsePosterior(local.sparse, by_output, statistics, known_whitenings=whitenings)
+        # Threads end with the fit.
+        return cls(sparse, values, replace(local, threads=None), of_differences)
+
+    # --- as `FittedPosterior` says ------------------------------------------------------------------------------------
+
+    @property
+    def bound(self) -> float:
+        """The log marginal likelihood of the approximation. It may be above or below that of the exact model."""
+        return self.of_differences.bound
+
+    @property
+    def upper_bound(self) -> float:
+        """No upper bound is known."""
+        return np.inf
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """The predictor of residuals, in internal units."""
+        predictor, known = self.of_differences.predictor, self._known
+        groups = [replace(group, near=rows) for group, rows in zip(predictor.groups, known, strict=True)]
+        return replace(predictor, groups=tuple(groups))
+
+    @property
+    def n_contrasts(self) -> np.ndarray:
+        """Number of residuals (o,) whose density the bound is about."""
+        return self.of_differences.n_contrasts
+
+    def weight_likelihoods(
+        self, prior: CoefficientPrior | None = None, rows: Rows | None = None
+    ) -> list[WeightLikelihood]:
+        """The likelihood of the weights of each output, as of `SparsePosterior`."""
+        if rows is None:
+            return self.of_differences.weight_likelihoods(prior)
+        return self.moved(self.sparse.prior if prior is None else prior, rows).weight_likelihoods()
+
+    def moved(self, prior: CoefficientPrior, rows: Rows) -> LocalPosterior:
+        """The posterior for other features of the same rows, at the same values."""
+        sparse, raw = replace(self.sparse, prior=prior), _all(rows)
+        return LocalPosterior.of(sparse, self.values, self.local.changed(sparse, raw))
+
+    def updated(self, rows: Rows, weight: float, lowest_noise: np.ndarray) -> LocalPosterior:
+        """The posterior with new rows, which are conditioned on earlier ones."""
+        before, by_output = self.of_differences, self.of_differences.values
+        local = self.local.with_more(_all(rows))
+        known, n = local.known(by_output, before.known_whitenings), len(self.local.rows.inputs)
+        new = local.statistics(by_output, known, local.neighbours(known, n), n)
+        sums = [old.scaled(weight) + more for old, more in zip(before.statistics, new, strict=True)]
+        return replace(self, local=local, of_differences=replace(before, statistics=sums))
+
+    def reweighted(self, prior: CoefficientPrior) -> LocalPosterior:
+        """The posterior for another prior of the weights that has the same offset."""
+        local = replace(self.local, sparse=replace(self.local.sparse, prior=prior))
+        of_differences = self.of_differences.reweighted(prior)
+        return LocalPosterior(replace(self.sparse, prior=prior), self.values, local, of_differences)
+
+    @property
+    def _known(self) -> list[KnownRows]:
+        return self.local.known(self.of_differences.values, self.of_differences.known_whitenings)
 
 
 def _all(rows: Rows) -> RawRows:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..data.rows import Columns, of_outputs, times_weights
 from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
+from .conditioning import Conditioned, KnownRows
 from .parameters import Values
 from .statistics import Kernel, Whitening
 
@@ -116,6 +117,9 @@ class PredictorGroup:
     # (o, p, m): if f is orthogonal to the features, the weights of the best fit are those of ``mean`` and ``root`` plus
     # this times the numbers of f. None: they are those of ``mean`` and ``root``.
     leak: np.ndarray | None = None
+    # The rows on which the residual of the inducing points is conditioned, for one output. V, H and k̃(x, x) - |v|² are
+    # then those of the differences of `conditioning`. None: there is no local part.
+    near: KnownRows | None = None
 
     @classmethod
     def of(
@@ -177,6 +181,8 @@ class Projected(NamedTuple):
     P: np.ndarray
     # (n,): k̃(x, x) - |v|², clipped at its rounding error.
     unexplained: np.ndarray
+    # (n,): the part of the mean from the nearest rows.
+    from_near: np.ndarray | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -242,7 +248,8 @@ class Predictor:
                 by = unit[columns_of_group][:, np.newaxis]
                 signal = group.signal * unit[columns_of_group] ** 2
                 mean, root = group.mean * by, group.root * by[:, np.newaxis]
-                groups.append(replace(group, outputs=columns_of_group, signal=signal, mean=mean, root=root))
+                near = None if group.near is None else group.near.scaled(float(by[0, 0]))
+                groups.append(replace(group, outputs=columns_of_group, signal=signal, mean=mean, root=root, near=near))
         return cls(tuple(groups), noise, offset, intercept, parts[0].shared)
 
     @property
@@ -271,7 +278,7 @@ class Predictor:
         """
         means, variances = [], []
         for group, rows in zip(self.groups, self.projected(inputs, features), strict=True):
-            means.append(group.mean @ rows.P)
+            means.append(group.mean @ rows.P + rows.from_near)
             if return_variance:
                 o, k, size = group.root.shape
                 deviation = group.root.reshape(o * k, size) @ rows.P
@@ -338,7 +345,8 @@ class Predictor:
         for group, rows in zip(self.groups, projected, strict=True):
             V = rows.P[: len(group.points)]
             K = group.kernel.at(group.hyperparameters, rows.inputs).matrix()
-            prior, unexplained = diagonal_of(K), K - V.T @ V
+            prior = diagonal_of(K)
+            unexplained = K - V.T @ V if group.near is None else group.near.covariance(rows.inputs)
             matrices, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
             for matrix, sizes_of_output, signal, root in zip(matrices, terms, group.signal, group.root, strict=True):
                 deviation = root[: len(root) - p] @ rows.P
@@ -398,7 +406,10 @@ class Predictor:
             P = np.empty((m + H.shape[1], len(H)))
             V = group.whitening.solve(prepared, out=P[:m])
             P[m:] = H.T
-            yield Projected(inputs_of_group, prepared, P, group.whitening.remaining(prepared, V))
+            if group.near is None:
+                yield Projected(inputs_of_group, prepared, P, group.whitening.remaining(prepared, V))
+            else:
+                yield Projected(inputs_of_group, prepared, P, *_conditioned(group.near, inputs_of_group, P))
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
@@ -422,3 +433,14 @@ class Predictor:
         for group, part in zip(self.groups, (first, *others), strict=True):
             ordered[group.outputs] = part
         return ordered
+
+
+def _conditioned(near: KnownRows, inputs: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turn P = [V; Hᵀ] of rows into that of their differences, and return their variance and the mean of near rows."""
+    latent, mean = np.empty(len(inputs)), np.empty(len(inputs))
+
+    def put(rows: slice, found: Conditioned) -> None:
+        P[:, rows], mean[rows], latent[rows] = found.differences[:, :-1].T, -found.differences[:, -1], found.latent
+
+    near.for_new(put, inputs, P.T)
+    return latent, mean

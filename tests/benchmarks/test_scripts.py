@@ -89,6 +89,7 @@ SMOKE = [
     smoke(
         "peers/against_peers", "--datasets smooth --peers 'scikit-learn GPR' 'scikit-learn BayesianRidge'", long=True
     ),
+    smoke("peers/neighbors", long=True),
     smoke("speed", "latency", long=True),
     smoke("speed", "casadi"),
     smoke("speed", "evaluation"),

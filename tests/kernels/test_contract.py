@@ -53,6 +53,41 @@ def test_gradients_agree_with_finite_differences(name, centre):
     assert np.abs(actual - expected).max() < 1e-7 * max(np.abs(expected).max(), 1.0)
 
 
+@pytest.mark.parametrize("centre", [None, CENTRE])
+@pytest.mark.parametrize("name", KERNELS)
+def test_covariances_within_small_sets(name, centre):
+    """Their values are those of the scikit-learn kernel, and gradients agree with finite differences."""
+    covariance, hyperparameters = parsed(KERNELS[name], centre)
+    sets = X[:30].reshape(6, 5, 2)
+    values, pull_back = covariance.within(hyperparameters, sets)
+    expected = np.array([KERNELS[name](rows) for rows in sets])
+    np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-12)
+    bars = np.random.RandomState(2).randn(6, 5, 5)
+    bars += bars.transpose(0, 2, 1)
+    differences = central_differences(
+        lambda logs: np.vdot(bars, covariance.within(np.exp(logs), sets)[0]), np.log(hyperparameters), 1e-5
+    )
+    np.testing.assert_allclose(
+        pull_back(bars), differences, rtol=1e-6, atol=1e-6 * np.abs(differences).max(initial=1.0)
+    )
+
+
+WITHOUT_DISTANCE = (sk.ConstantKernel, sk.DotProduct, FunctionKernel)
+
+
+@pytest.mark.parametrize("name", SIMPLE)
+def test_near_rows_are_correlated(name):
+    """The nearest row in the coordinates of nearness has the largest correlation."""
+    covariance, hyperparameters = parsed(SIMPLE[name])
+    coordinates = covariance.nearness(hyperparameters, X)
+    assert (coordinates.shape[1] == 0) == isinstance(SIMPLE[name], WITHOUT_DISTANCE)
+    if coordinates.shape[1] == 0:
+        return
+    K = SIMPLE[name](X)
+    distances = np.linalg.norm(coordinates[0] - coordinates[1:], axis=1)
+    assert K[0, 1:][distances.argmin()] == pytest.approx(K[0, 1:].max(), rel=1e-9)
+
+
 def plain(kernel, A, B, values):
     """The formulas in plain autograd.numpy; takes the hyperparameters off the front of a list."""
     if isinstance(kernel, sk.KernelOperator):
