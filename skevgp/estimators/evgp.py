@@ -75,8 +75,8 @@ class EVGPRegressor(GaussianProcess):
         Number of inducing points. If ``"auto"``, it grows while this raises the bound. See
         :doc:`/howto/inducing_points`.
     n_neighbors : int, default=0
-        Number of training rows near a row on which the residual of the inducing points is conditioned. With 60, a model
-        of 5,000 rows or more is about as accurate as an exact Gaussian process. See :doc:`/guide/neighbors`.
+        Number of training rows near a row on which the residual of the inducing points is conditioned. With thousands
+        of rows, try 60. If 0, the model has the inducing points only. See :doc:`/guide/neighbors`.
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
         Start of the inducing points: cluster centres, rows of large residual variance (``"greedy"``), or points in the
         space of ``kernel_map``. If ``"auto"``, L-BFGS tries both.

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from ..data.rows import Rows
 from ..model.bounds import optimal_posteriors
 from ..model.conditioning import KnownRows
-from ..model.local import LocalModel, LocalObjective, values_by_output
+from ..model.local import LocalModel, values_by_output
 from ..model.parameters import ParameterTable, Values
 from ..solvers import LBFGS
 from ..solvers.base import Tolerance
@@ -42,10 +42,7 @@ _ONE_FOLD = 2000
 
 def with_local_part(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, Values]:
     """A sparse fit, its model with all rows, and the values of kernel, signal and noise for the local part."""
-    few = model
-    if len(model.rows) > _SPARSE_ROWS:
-        few = replace(model, rows=model.rows.random_subset(_SPARSE_ROWS, np.random.RandomState(model.seed)))
-    fitted, fit = run(few)
+    fitted, fit = run(replace(model, rows=_sample(model.rows, _SPARSE_ROWS, model.seed)))
     model = replace(fitted, rows=model.rows)
     if fitted.exact is not None or model.max_iter == 0 or model.monitor.stopped:
         return model, fit, fit.values
@@ -66,10 +63,9 @@ def local_model(model: Model, rows: Rows | None = None, most: int | None = None)
     return replace(local, n_threads=model.problem.n_threads)
 
 
-def _sample(model: Model, size: int) -> Rows:
-    """Random rows of a model."""
-    rows = model.rows
-    return rows if len(rows) <= size else rows.random_subset(size, np.random.RandomState(model.seed))
+def _sample(rows: Rows, size: int, seed: int) -> Rows:
+    """Random rows, or all of them if there are no more than ``size``."""
+    return rows if len(rows) <= size else rows.random_subset(size, np.random.RandomState(seed))
 
 
 class _Quick(LBFGS):
@@ -87,9 +83,9 @@ def _most_likely(model: Model, values: Values) -> Values:
     sizes = [size for size in _SAMPLES[:-1] if size < n] + [min(n, _SAMPLES[-1])] * _ROUNDS
     highest, last = -np.inf, None
     for number, size in enumerate(sizes):
-        local = local_model(model, _sample(model, size), _NEIGHBOURS)
+        local = local_model(model, _sample(model.rows, size, model.seed), _NEIGHBOURS)
         neighbours = local.neighbours(local.known(values_by_output(model.sparse, table.values_at_start())))
-        objective = _Shared(LocalObjective(local, neighbours, model.rows.is_constant()), model, table)
+        objective = _Objective(local, neighbours, model, table)
         starts = [table.start()] if number else _starts(local, neighbours, model, table)
         ends = [
             _Quick().minimise(
@@ -173,15 +169,21 @@ def _likelihoods(local: LocalModel, values: Values, neighbours: list[np.ndarray]
     return np.where(np.isfinite(found), found, -np.inf)
 
 
-class _Shared:
-    """A local likelihood as a function of the parameters that the sparse model has: outputs may share them."""
+class _Objective:
+    """Minus the local likelihood per row, and its gradient, as a function of the sparse model's flat vector.
 
-    def __init__(self, objective: LocalObjective, model: Model, table: ParameterTable):
-        self.objective, self.sparse, self.table = objective, model.sparse, table
+    Outputs may share its parameters. Constant outputs do not count.
+    """
+
+    def __init__(self, local: LocalModel, neighbours: list[np.ndarray], model: Model, table: ParameterTable):
+        self.local, self.neighbours, self.sparse, self.table = local, neighbours, model.sparse, table
+        self.left_out = model.rows.is_constant()
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
-        values = self.table.values(flat)
-        loss, by_output = self.objective(values_by_output(self.sparse, values))
+        values, n = self.table.values(flat), self.local.rows.total
+        likelihood, by_output = self.local.log_likelihood(
+            values_by_output(self.sparse, values), self.neighbours, self.left_out
+        )
         gradient = {name: np.zeros(value.shape) for name, value in values.items()}
         gradient["signal"], gradient["noise"] = by_output["signal"], by_output["noise"]
         if values["hyperparameters"].ndim == 1:
@@ -189,7 +191,7 @@ class _Shared:
         else:
             groups = [self.sparse.group_of(output) for output in range(len(values["noise"]))]
             np.add.at(gradient["hyperparameters"], groups, by_output["hyperparameters"])
-        return loss, self.table.gradient(gradient)
+        return -likelihood / n, -self.table.gradient(gradient) / n
 
 
 # --- left-out rows ----------------------------------------------------------------------------------------------------
@@ -249,9 +251,9 @@ def calibrated_locally(model: Model, values: Values, by: CrossValidation) -> Val
         # A few groups may say by chance that the signal is small.
         limits["signal"][:, 0] = np.minimum(signal, limits["signal"][:, 1])
     folds = [_fold(model, values, *fold) for fold in _folds(model, by)]
-    for output in range(len(noise)):
-        if not folds or not (free["noise"][output] or free["signal"][output]):
-            continue
+    if not folds:
+        return values
+    for output in np.flatnonzero(free["noise"] | free["signal"]):
         parts = [of_fold[output] for of_fold in folds]
         signal[output], noise[output] = _best_variances(
             parts,
@@ -296,7 +298,7 @@ def _fold(
     """Rows that are predicted from others. If ``one_by_one``, all rows but itself are neighbours of a row."""
     by_output = values_by_output(model.sparse, values)
     unit = by_output | {name: np.ones_like(values[name]) for name in ("signal", "noise")}
-    local = local_model(model, _sample(replace(model, rows=model.rows.subset(others)), _SAMPLES[-1]))
+    local = local_model(model, _sample(model.rows.subset(others), _SAMPLES[-1], model.seed))
     seen = local.known(unit)
     rows = model.rows if one_by_one else model.rows.subset(others)
     everything = np.arange(len(rows))

@@ -196,7 +196,9 @@ class KnownRows:
             crossed *= ~missing
             ratio = np.where(missing, 1.0, ratio)
         variances = np.einsum("bkk->bk", K)
-        np.einsum("bkk->bk", covariance)[...] += np.maximum(ratio, LEAST * variances[:, :k])
+        # The smallest number keeps the matrix from being singular where k̃(x, x) is 0.
+        noise = np.maximum(ratio, np.maximum(LEAST * variances[:, :k], np.finfo(float).tiny))
+        np.einsum("bkk->bk", covariance)[...] += noise
         weights = np.linalg.solve(covariance, crossed[:, :, np.newaxis])[:, :, 0]
         latent = R[:, k, k] - np.einsum("bk,bk->b", weights, crossed)
         differences = joint[:, k] - (weights[:, np.newaxis] @ joint[:, :k])[:, 0]

@@ -258,15 +258,3 @@ class _Gradient:
         self._by_neighbour[:, rows] = w, a, c_bar
         self._of_row[:, rows] = v_bar + 2.0 * aV, 2.0 * wV, V[:, k]
         return found.pull_back(R_bar), of_signal, of_ratio
-
-
-class LocalObjective:
-    """Minus the log likelihood of a `LocalModel` per row, and its gradient, as a function of the values."""
-
-    def __init__(self, model: LocalModel, neighbours: list[np.ndarray], left_out: np.ndarray | None = None):
-        self.model, self.neighbours, self.left_out = model, neighbours, left_out
-
-    def __call__(self, values: Values) -> tuple[float, Values]:
-        value, gradient = self.model.log_likelihood(values, self.neighbours, self.left_out)
-        n = self.model.rows.total
-        return -value / n, {name: -bar / n for name, bar in gradient.items()}
