@@ -1,6 +1,7 @@
 """`EVGPRegressor(n_neighbors=...)`: a local part beside the inducing points."""
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -30,6 +31,10 @@ FIXED = ConstantKernel(1.3, "fixed") * RBF([0.5, 0.4], "fixed") + WhiteKernel(0.
 ROUGH = ConstantKernel(1.3, "fixed") * Matern([0.5, 0.4], "fixed", nu=0.5) + WhiteKernel(0.01, "fixed")
 
 
+def rms(errors, axis=None):
+    return np.sqrt(np.mean(np.square(errors), axis=axis))
+
+
 def model(**arguments):
     return EVGPRegressor(**{"n_inducing": 15, "n_neighbors": 12, "random_state": 0, **arguments})
 
@@ -48,7 +53,7 @@ def fitted():
 def test_few_inducing_points_suffice(fitted):
     """Fifteen points alone explain little of these functions. Intervals are right too."""
     sparse = model(n_neighbors=0).fit(X, Y)
-    errors = [np.sqrt(np.mean((own.predict(X_NEW) - waves(X_NEW)) ** 2)) for own in (fitted, sparse)]
+    errors = [rms(own.predict(X_NEW) - waves(X_NEW)) for own in (fitted, sparse)]
     assert errors[0] < 0.25 * errors[1]
     y_new = waves(X_NEW) + 0.05 * np.random.RandomState(1).randn(200, 2)
     mean, std = fitted.predict(X_NEW, return_std=True)
@@ -183,7 +188,7 @@ def test_details_are_found_whatever_is_beside_them(case):
         decaying = ParametricFeatures(decay, {"rate": LogNormal(0.1, 0.3)})
         own = model(feature_map=decaying, n_neighbors=12).fit(X, y)
         mean = own.partial_fit(X[:5], y[:5]).predict(X_NEW)
-    assert np.sqrt(np.mean((mean - waves(X_NEW)[:, 0]) ** 2)) < 0.2
+    assert rms(mean - waves(X_NEW)[:, 0]) < 0.2
 
 
 def test_copies_and_files_predict_the_same(fitted, tmp_path):
@@ -240,8 +245,8 @@ def test_nasty_data_end_right(name):
     assert np.isfinite(std).all()
     assert (std >= 0.0).all()
     # No worse than the mean of y, by more than chance.
-    error = np.sqrt(np.mean((mean.reshape(y.shape) - y) ** 2))
-    assert error <= 1.05 * np.sqrt(np.mean((y - y.mean(axis=0)) ** 2)) + 1e-9 * np.abs(y).max()
+    error = rms(mean.reshape(y.shape) - y)
+    assert error <= 1.05 * rms(y - y.mean(axis=0)) + 1e-9 * np.abs(y).max()
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -297,5 +302,20 @@ def test_what_needs_a_smooth_model_names_the_argument(name, fitted, tmp_path):
 
 def test_residuals_of_columns_of_X():
     own = ResidualRegressor(model(), base=[0, 1]).fit(X, Y + X)
-    assert np.sqrt(np.mean((own.predict(X_NEW) - waves(X_NEW) - X_NEW) ** 2)) < 0.1
+    assert rms(own.predict(X_NEW) - waves(X_NEW) - X_NEW) < 0.1
     assert own.jacobian(X_NEW[:3]).shape == (3, 2, 2)
+
+
+def test_summary_of_a_sparse_fit_says_what_neighbours_would_gain():
+    rows, rng = np.random.RandomState(1).uniform(-2.0, 2.0, (3000, 2)), np.random.RandomState(2)
+    y, y_new = (waves(some) + 0.05 * rng.randn(len(some), 2) for some in (rows, X_NEW))
+    few, many, near = (
+        EVGPRegressor(n_inducing=m, kernel=FIXED, n_neighbors=k, random_state=0) for m, k in ((8, 0), (150, 0), (8, 60))
+    )
+    assert "n_neighbors=60 would lower the error by less than 5 %" in str(many.fit(rows, y).summary())
+    said = float(re.search(r"lower the error by about (\d+) %", str(few.fit(rows, y).summary()))[1])
+    before, after = (rms(one.predict(X_NEW) - y_new, axis=0) for one in (few, near.fit(rows, y)))
+    # The geometric mean of the outputs. 500 and 200 rows say it to a few percent.
+    assert_allclose(said, 100.0 * (1.0 - np.exp(np.log(after / before).mean())), atol=5.0)
+    assert "neighbors" not in str(few.fit(rows, y, groups=np.arange(3000) % 7).summary())
+    assert "would" not in str(near.summary())

@@ -187,6 +187,7 @@ def svgp(job: SimpleNamespace) -> Fitted:
 MODELS = {
     "sparse": Model(partial(evgp, 0), ("skevgp.estimators.evgp",)),
     "neighbors": Model(partial(evgp, N_NEIGHBORS), ("skevgp.estimators.evgp",)),
+    "neighbors-80": Model(partial(evgp, 80), ("skevgp.estimators.evgp",)),
     "exact-2000": Model(partial(exact, 2000), ("skevgp.estimators.egp",)),
     "exact-5000": Model(partial(exact, 5000), ("skevgp.estimators.egp",)),
     "boosting": Model(boosting, ("sklearn.ensemble",)),

@@ -14,8 +14,8 @@ from sklearn.neighbors import NearestNeighbors
 _COMPARED = 512
 # So many nearest rows are asked for, in units of the wanted number, and some more. About half or more come earlier.
 _ASKED, _MORE = 3, 16
-# With more columns, a tree visits almost all rows.
-_MOST_COLUMNS = 12
+# If rows spread over more dimensions than this, a tree visits almost all of them.
+_MOST_DIMENSIONS = 12
 # Rows in a leaf of the tree, and how much farther than the nearest rows those found may be. This saves two thirds of
 # the time, and in eight columns the farthest of 60 rows is 0.3 % farther.
 _LEAF, _FARTHER = 64, 0.5
@@ -36,6 +36,13 @@ class NearestRows:
         return cKDTree(self.coordinates, leafsize=_LEAF)
 
     @cached_property
+    def _dimension(self) -> float:
+        """The number of columns over which the rows spread. Columns with a long length scale hardly count."""
+        variances = self.coordinates.var(axis=0)
+        # This is d for equal variances, and 1 if all but one are 0.
+        return float(variances.sum() ** 2 / max(np.square(variances).sum(), np.finfo(float).tiny))
+
+    @cached_property
     def _brute_force(self) -> NearestNeighbors:
         return NearestNeighbors(algorithm="brute").fit(self.coordinates)
 
@@ -48,7 +55,7 @@ class NearestRows:
             return np.broadcast_to(np.arange(k), (q, k))
         if k == 0:
             return np.empty((q, 0), dtype=int)
-        if d > _MOST_COLUMNS:
+        if self._dimension > _MOST_DIMENSIONS:
             return np.asarray(self._brute_force.kneighbors(coordinates, k, return_distance=False))
         _, nearest = self._tree.query(coordinates, np.arange(1, k + 1), eps=_FARTHER, workers=n_threads)
         return np.asarray(nearest)

@@ -22,6 +22,7 @@ from ..fitting.fit import fit_model
 from ..fitting.fitted import Fitted
 from ..fitting.folds import CrossValidation
 from ..fitting.inducing import Placement
+from ..fitting.local import gain_of_neighbours
 from ..fitting.messages import DEPENDENT_ROWS, interrupted
 from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes
 from ..fitting.prior import CoefPrior, as_coef_prior
@@ -328,6 +329,9 @@ class EVGPRegressor(GaussianProcess):
                     fitted, data, posterior_of, numbers, covariance, refit, monitor, self._columns_changed
                 )
             theta = None if calibration is None else calibration.posterior
+            self._gain_of_neighbours = None
+            if theta is None and problem.max_iter > 0 and not monitor.interrupted:
+                self._gain_of_neighbours = gain_of_neighbours(problem, fitted)
             self._set_posterior(data, problem, problem.spec, fitted, theta)
             self._set_attributes(fitted, data)
         self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)

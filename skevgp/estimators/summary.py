@@ -12,6 +12,7 @@ import numpy as np
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import ConstantKernel, Product
 
+from ..fitting.local import NEIGHBOURS_OF_ESTIMATE
 from ..fitting.prior import coef_names
 from ..fitting.theta import ThetaPosterior
 from ..utils.optional import require
@@ -22,6 +23,8 @@ _OF_A_JOINT = ("q", "q̇", "q̈", "torque")
 _LINES, _WIDTH = 40, 100
 # Maximum number of lines of a fact, such as a kernel of many columns.
 _FACT_LINES = 6
+# In percent: a smaller gain from the local part is not shown as a number.
+_LITTLE = 5
 _CELL = 'style="text-align: left; padding: 0 1em 0 0"'
 _TABLE = 'style="margin: 0.3em 0 1em 0; font-size: inherit"'
 _SCROLLED = 'style="max-height: 30em; max-width: fit-content; overflow: auto"'
@@ -62,6 +65,8 @@ class ModelSummary:
         All numbers, in the order of the text.
     lower_bound, upper_bound : float or None
         Bounds on the log marginal likelihood, in nats, which are equal for an exact model. None if they are not known.
+    advice : str
+        Text on what ``n_neighbors`` would gain, or empty.
 
     Examples
     --------
@@ -93,6 +98,7 @@ class ModelSummary:
     parameters: tuple[Parameter, ...]
     lower_bound: float | None = None
     upper_bound: float | None = None
+    advice: str = ""
 
     def to_frame(self) -> Any:
         """Return all numbers as a pandas.DataFrame.
@@ -112,7 +118,7 @@ class ModelSummary:
 
     def __str__(self) -> str:
         """Return the text, with the first lines of weights if there are many."""
-        parts = ["\n".join(filter(None, [self.title, self.certificate]))]
+        parts = ["\n".join(filter(None, [self.title, self.certificate, self.advice]))]
         for output, facts in self._facts():
             width = max(map(len, facts)) + 2
             lines = [] if output is None else [f"output {output}"]
@@ -141,7 +147,7 @@ class ModelSummary:
 
     def _repr_html_(self) -> str:
         """Return tables, with all names escaped."""
-        parts = [f"<p><b>{escape(self.title)}</b><br>{escape(self.certificate)}</p>"]
+        parts = [f"<p><b>{escape(self.title)}</b><br>{escape(self.certificate)}<br>{escape(self.advice)}</p>"]
         for output, facts in self._facts():
             parts.append("" if output is None else f"<p>output <b>{escape(str(output))}</b></p>")
             parts.append(html_table(list(facts.items())))
@@ -228,6 +234,7 @@ def of_gaussian_process(model: Any) -> ModelSummary:
         tuple(numbers),
         lower,
         upper,
+        _advice(model._gain_of_neighbours),
     )
 
 
@@ -304,6 +311,15 @@ def _certificate(lower: Any, upper: Any) -> str:
     if np.isinf(upper):
         return f"log marginal likelihood: at least {lower:.2f} nats"
     return f"log marginal likelihood: from {lower:.2f} to {upper:.2f} nats"
+
+
+def _advice(gain: np.ndarray | None) -> str:
+    """Text on the share of the error of each output that a local part would take away."""
+    if gain is None:
+        return ""
+    mean = 100.0 * (1.0 - np.exp(np.mean(np.log(np.maximum(1.0 - gain, np.finfo(float).tiny)))))
+    least = f"by about {mean:.0f} %" if mean >= _LITTLE else f"by less than {_LITTLE} %"
+    return f"n_neighbors={NEIGHBOURS_OF_ESTIMATE} would lower the error {least}"
 
 
 def _plus_minus(value: float, std: float) -> str:

@@ -8,18 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ..data.rows import Rows
+from ..data.rows import LocalSource, Rows
 from ..model.bounds import optimal_posteriors
 from ..model.conditioning import KnownRows
 from ..model.local import LocalModel, values_by_output
 from ..model.parameters import ParameterTable, Values
+from ..model.posterior import SparsePosterior
 from ..solvers import LBFGS
 from ..solvers.base import Tolerance
 from ..solvers.lbfgs import Descent
 from ..utils.linalg import NotPositiveDefiniteError
 from .calibration import factor_in_doubt, means_of_groups
+from .doubts import of_residuals
+from .fitted import Fitted
 from .folds import FEWEST_ROWS, PREDICTED_ROWS, CrossValidation, Fold
 from .model import Model
+from .problem import Problem
 from .runs import Fit
 
 # Inducing points and length scales come from a sparse fit to at most so many rows.
@@ -38,6 +42,12 @@ _ROUNDS, _GAIN = 2, 2e-3
 _REACH, _CLOSE = 4.0, 0.1
 # With so many rows, one fold is enough.
 _ONE_FOLD = 2000
+# What a local part would gain is estimated for fits to so many rows, with this number of neighbours, on so many
+# left-out rows, among at most so many. With fewer rows, a fit with the local part takes seconds: one may try it.
+_FEWEST, NEIGHBOURS_OF_ESTIMATE = 3000, 60
+_JUDGED, _AMONG = 500, 100_000
+# The noise of a sparse fit explains what the inducing points leave out. So it is tried times these factors.
+_LESS_NOISE = (1.0, 0.1, 0.01, 0.001)
 
 
 def with_local_part(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, Values]:
@@ -309,10 +319,7 @@ def _fold(
         k = min(known.n_neighbors, len(known) - one_by_one)
         nearest = replace(known, n_neighbors=k + one_by_one).nearest(of_output.inputs)
         if one_by_one:
-            # The row itself is left out, or the last of its copies.
-            itself = nearest == predicted[:, np.newaxis]
-            itself[~itself.any(axis=1), -1] = True
-            nearest = nearest[~itself].reshape(len(predicted), k)
+            nearest = _without(predicted, nearest)
         distinct, places = np.unique(nearest, return_inverse=True)
         counts, precision = (
             np.ones(len(predicted)) if part is None else part for part in (of_output.counts, of_output.precision)
@@ -334,6 +341,13 @@ def _fold(
             )
         )
     return parts
+
+
+def _without(rows: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+    """The nearest rows (q, k) of (q, k + 1) without the row itself, or without the last one of its copies."""
+    itself = nearest == rows[:, np.newaxis]
+    itself[~itself.any(axis=1), -1] = True
+    return nearest[~itself].reshape(len(rows), -1)
 
 
 def _best_variances(
@@ -369,3 +383,51 @@ def _best_variances(
         return signal, noise
     best, ratio = tried[min(tried)]
     return best, float(np.clip(best * ratio, *noises))
+
+
+# --- what a local part would gain -------------------------------------------------------------------------------------
+
+
+def gain_of_neighbours(problem: Problem, fitted: Fitted) -> np.ndarray | None:
+    """The share (o,) of the RMS error of left-out rows that their nearest rows would take away from a sparse fit.
+
+    Kernel and weights stay those of the sparse fit. A fit with the local part finds better ones and gains more. It is
+    None for few rows, for rows that depend on each other, and for models without a local part.
+    """
+    variant, noise, source = problem.variant, problem.noise, problem.source
+    alike = problem.groups is not None or fitted.dependent
+    if variant.n_neighbors or variant.family != "full" or noise.heavy_tails or noise.inputs is not None or alike:
+        return None
+    if not isinstance(source, LocalSource) or source.n_rows < _FEWEST:
+        return None
+    gains = np.zeros(problem.n_outputs)
+    for model in fitted.models:
+        if isinstance(model.posterior, SparsePosterior):
+            rows = problem.units.rows(source).outputs(model.outputs)
+            gains[model.outputs] = 1.0 - _error_with_neighbours(rows, model.posterior)
+    return gains
+
+
+def _error_with_neighbours(rows: Rows, posterior: SparsePosterior) -> np.ndarray:
+    """The RMS error (o,) of some rows from their nearest other rows too, as a share of that from inducing points."""
+    # The same rows for each fit, so that the random numbers of a user are not used up.
+    rows, rng = _sample(rows, _AMONG, seed=0), np.random.RandomState(0)
+    judged, raw = rows.chosen(_JUDGED, rng), rows.some(np.arange(len(rows)))
+    local = LocalModel.of(posterior.sparse, raw, NEIGHBOURS_OF_ESTIMATE + 1, np.arange(len(rows)))
+    known = local.known(values_by_output(posterior.sparse, posterior.values))
+    nearest = [_without(judged, own.nearest(own.inputs[judged])) for own in known]
+    used = np.unique(np.concatenate([judged, *map(np.ravel, nearest)]))
+    mean, _ = of_residuals(posterior.predictor).predict(raw.inputs[used], raw.features[used])
+    residuals, judged, shares = raw.targets[used] - mean, np.searchsorted(used, judged), []
+    for output, (own, positions) in enumerate(zip(known, nearest, strict=True)):
+        of_output, near = replace(own.some(used), linear=residuals[:, [output]]), np.searchsorted(used, positions)
+        errors = np.empty((len(_LESS_NOISE), len(judged)))
+        for some in of_output.slices(*near.shape):
+            inputs, joint = of_output.inputs[judged[some]], of_output.joint(judged[some])
+            for index, factor in enumerate(_LESS_NOISE):
+                less_noisy = of_output.with_ratio(factor * of_output.ratio)
+                # r_i - wᵀ r_N, without v and β, whose means the residuals are about.
+                errors[index, some] = less_noisy.conditioned(near[some], inputs, joint).differences[:, -1]
+        alone = np.square(residuals[judged, output]).mean()
+        shares.append(np.sqrt(np.square(errors).mean(axis=1).min() / alone) if alone > 0.0 else 1.0)
+    return np.minimum(shares, 1.0)
