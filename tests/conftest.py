@@ -14,7 +14,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # scikit-learn 1.6 takes no rows of a pyarrow table.
 _SKLEARN = tuple(int(part) for part in version("scikit-learn").split(".")[:2])
-_FRAMES = ["pandas.DataFrame", "polars.DataFrame", *(["pyarrow.table"] if _SKLEARN >= (1, 7) else [])]
+_FRAMES = ["pandas.DataFrame", "polars.DataFrame"]
+if _SKLEARN >= (1, 7):
+    _FRAMES.append(pytest.param("pyarrow.table", marks=pytest.mark.long))  # type: ignore[arg-type]
 
 
 @pytest.fixture(params=_FRAMES)
@@ -22,3 +24,12 @@ def frame_of(request):
     """Make a data frame of named columns; of each package in turn."""
     package, name = request.param.split(".")
     return getattr(import_module(package), name)
+
+
+def pytest_unconfigure(config):
+    """Say in the last line how to run the rest."""
+    if config.option.markexpr == "not long" and not hasattr(config, "workerinput"):
+        rest = "pip install -e '.[physics,plot,dask,test-long]' && python -m pytest -n auto -m long"
+        config.get_terminal_writer().line(
+            f"These were the quick tests. The long ones, half an hour on two cores: {rest}"
+        )

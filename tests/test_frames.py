@@ -1,9 +1,9 @@
 import sys
+from importlib import import_module
 
 import numpy as np
 import pandas as pd
 import polars as pl
-import pyarrow as pa
 import pytest
 
 from skevgp.utils.frames import FrameColumns
@@ -11,8 +11,15 @@ from skevgp.utils.frames import FrameColumns
 COLUMNS = {"a": [1.0, 2.0], "word": ["hot", "cold"]}
 
 
-@pytest.mark.parametrize("frame", [pd.DataFrame(COLUMNS), pl.DataFrame(COLUMNS), pa.table(COLUMNS)], ids=type)
-def test_frame_comes_back(frame):
+def table_of_pyarrow(columns):
+    return import_module("pyarrow").table(columns)
+
+
+@pytest.mark.parametrize(
+    "frame_of", [pd.DataFrame, pl.DataFrame, pytest.param(table_of_pyarrow, marks=pytest.mark.long)]
+)
+def test_frame_comes_back(frame_of):
+    frame = frame_of(COLUMNS)
     again = FrameColumns.of(frame).frame()
     assert type(again) is type(frame)
     for name, values in COLUMNS.items():

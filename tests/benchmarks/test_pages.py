@@ -59,10 +59,17 @@ PAGES = {
     "bounds": ("bounds", lambda own, rows: own.tables_of(rows, own.harness.frame(RESULTS / "bounds_cost.csv"))),
     "calibration": ("calibration", lambda own, rows: own.tables_of(rows)),
     "robustness": ("robustness", lambda own, rows: own.tables_of(rows)),
+    "neighbors": ("peers.neighbors", lambda own, rows: own.tables_of(rows)),
 }
 
 
-@pytest.mark.parametrize("page", PAGES)
+# One page is enough for the quick tests.
+SAMPLE = "bounds"
+
+
+@pytest.mark.parametrize(
+    "page", [page if page == SAMPLE else pytest.param(page, marks=pytest.mark.long) for page in PAGES]
+)
 def test_page_has_the_numbers_of_its_csv(script, page):
     name, tables_of = PAGES[page]
     own, text = script(name), (RESULTS / f"{page}.md").read_text()
@@ -73,6 +80,7 @@ def test_page_has_the_numbers_of_its_csv(script, page):
     assert own.harness.filled(text, tables) == text
 
 
+@pytest.mark.long
 def test_pages_of_several_csvs_have_their_numbers(script):
     peers, robots, tables = (script(name) for name in ("peers.against_peers", "robots", "tables"))
     frame, filled = peers.harness.frame, peers.harness.filled
