@@ -11,7 +11,7 @@ from skevgp import EGPRegressor
 from .accuracy import MODELS, Problem, errors, jitter_of, sparse
 from .precise import DIGITS
 
-SHAPE = {"n": 12, "m": 5, "d": 2, "p": 2}
+SHAPE = {"n": 8, "m": 4, "d": 2, "p": 2}
 # A backward stable algorithm is up to so many times as far off as one with a unit in the last place of each number.
 SLACK = SHAPE["n"] + SHAPE["m"]
 

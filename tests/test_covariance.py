@@ -1,5 +1,7 @@
 """Standard deviations, covariances and samples describe one distribution, also where rounding outweighs the noise."""
 
+from functools import cache
+
 import mpmath as mp
 import numpy as np
 import pytest
@@ -18,19 +20,29 @@ MODELS = {
     "exact, a line": (EGPRegressor(), Y[:, 1]),
     "exact, several outputs": (EGPRegressor(), Y),
     "exact, shared weights": (EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(shared=True)), Y),
-    "sparse, diagonal": (EVGPRegressor(n_inducing=12, solver=LBFGS(posterior="diagonal"), random_state=0), Y),
+    "sparse, diagonal": (
+        EVGPRegressor(n_inducing=12, solver=LBFGS(posterior="diagonal"), sharing="all", random_state=0),
+        Y,
+    ),
     "sparse, shared weights": (
-        EVGPRegressor(PolynomialFeatures(1), n_inducing=12, coef_prior=CoefPrior(shared=True), random_state=0),
+        EVGPRegressor(
+            PolynomialFeatures(1), n_inducing=12, coef_prior=CoefPrior(shared=True), sharing="kernel", random_state=0
+        ),
         Y,
     ),
     "residual": (ResidualRegressor(EVGPRegressor(n_inducing=12, random_state=0)), Y[:, 0]),
 }
 
 
-@pytest.fixture(scope="module", params=MODELS)
-def model(request):
-    regressor, y = MODELS[request.param]
+@cache
+def fitted(name):
+    regressor, y = MODELS[name]
     return regressor.fit(X, y)
+
+
+@pytest.fixture(params=MODELS)
+def model(request):
+    return fitted(request.param)
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -70,7 +82,13 @@ def test_variance_of_a_noise_free_parabola_is_right_to_rounding():
 
 
 @pytest.mark.parametrize(
-    "function", [np.square, np.exp, lambda x: x + 1.0, np.sinc], ids=["square", "exp", "line", "sinc"]
+    "function",
+    [
+        pytest.param(np.square, id="square"),
+        pytest.param(np.exp, id="exp", marks=pytest.mark.long),
+        pytest.param(lambda x: x + 1.0, id="line", marks=pytest.mark.long),
+        pytest.param(np.sinc, id="sinc"),
+    ],
 )
 def test_more_inducing_points_do_not_widen_the_std(function):
     """With points at all rows it is the exact model's; the signal does not grow to make up for a jitter."""
@@ -93,8 +111,7 @@ def test_more_inducing_points_do_not_widen_the_std(function):
 @pytest.mark.parametrize("include_noise", [True, False])
 @pytest.mark.parametrize("name", ["exact, shared weights", "sparse, shared weights"])
 def test_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noise):
-    regressor, y = MODELS[name]
-    regressor.fit(X, y)
+    regressor = fitted(name)
     _, std = regressor.predict(X_NEW, return_std=True, include_noise=include_noise)
     _, joint = regressor.predict(X_NEW, return_cov="joint", include_noise=include_noise)
     assert_allclose(np.diag(joint), std.ravel() ** 2, rtol=1e-9)
@@ -108,8 +125,7 @@ def test_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noi
 @pytest.mark.parametrize("name", ["exact, several outputs", "sparse, shared weights"])
 def test_roots_without_noise_need_no_eigenvalues(name, monkeypatch):
     """Eigenvalues take ten times as long as the samples with noise."""
-    regressor, y = MODELS[name]
-    regressor.fit(X, y)
+    regressor = fitted(name)
     monkeypatch.setattr("skevgp.utils.linalg.eigh", None)
     rows = np.vstack([np.linspace(-1.0, 2.0, 200)[:, np.newaxis], X])
     assert np.isfinite(regressor.sample_y(rows, include_noise=False)).all()

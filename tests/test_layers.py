@@ -26,7 +26,7 @@ def imports_at_load(tree):
             yield node.module.partition(".")[0]
         elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             yield from imports_at_load(ast.Module(node.orelse, []))
-        elif not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        elif isinstance(node, (ast.stmt, ast.ExceptHandler)) and not isinstance(node, ast.FunctionDef):
             yield from imports_at_load(node)
 
 

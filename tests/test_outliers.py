@@ -49,7 +49,10 @@ def test_without_outliers_it_is_the_fit_with_gaussian_noise():
     assert robust.upper_bound_ == np.inf
 
 
-@pytest.mark.parametrize("parameters", VARIANTS.values(), ids=VARIANTS)
+@pytest.mark.parametrize(
+    "parameters",
+    [pytest.param(VARIANTS[name], id=name, marks=[pytest.mark.long] * (name == "auto")) for name in VARIANTS],
+)
 def test_outliers_do_not_change_fit(parameters):
     robust = evgp(**parameters).fit(X, WRONG)
     clean = evgp(**{**parameters, "noise": "gaussian"})
