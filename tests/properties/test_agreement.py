@@ -88,7 +88,7 @@ def test_casadi_predicts(case, include_noise, parametric):
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
-@fewer(5)
+@fewer(4)
 @given(fixed_cases(known_maps=True, smooth=True))
 def test_c_predicts(case):
     model = case.fitted()
