@@ -32,18 +32,18 @@ def trajectory(n_joints, seed, seconds=10.0, dt=0.02):
 class Arm:
     """A robot whose model is wrong, with friction, and its log."""
 
-    def __init__(self, robot="ur5", seed=0, noise=0.02, n_groups=3, error=0.2, missed=None):
+    def __init__(self, robot="ur5", seed=0, noise=0.02, n_groups=3, error=0.2, missed=None, dt=0.05):
         self.nominal = load_robot(robot)
         self.model = perturb_robot(self.nominal, error, random_state=seed) if error else self.nominal
         rng, n = np.random.default_rng(seed), self.nominal.nv
         limit = np.minimum(np.where(self.nominal.upperEffortLimit > 0.0, self.nominal.upperEffortLimit, 10.0), 50.0)
         self.viscous, self.coulomb = rng.uniform(0.02, 0.1, (2, n)) * limit
         self.missed = missed or (lambda X: 0.0)
-        self.X = np.concatenate([trajectory(n, 100 * seed + group) for group in range(n_groups)])
+        self.X = np.concatenate([trajectory(n, 100 * seed + group, dt=dt) for group in range(n_groups)])
         self.groups = np.repeat(np.arange(n_groups), len(self.X) // n_groups)
         clean = self.torque(self.X)
         self.y = clean + noise * clean.std(axis=0) * rng.normal(size=clean.shape)
-        self.new = trajectory(n, 99 + 100 * seed)
+        self.new = trajectory(n, 99 + 100 * seed, dt=dt)
 
     def torque(self, X):
         q, v, a = np.split(X, 3, axis=1)
@@ -94,7 +94,7 @@ def gear(X):
 
 @pytest.mark.long
 def test_joints_own_columns_tell_what_physics_missed():
-    arm = Arm(missed=gear)
+    arm = Arm(missed=gear, dt=0.02)
     truth = arm.torque(arm.new)
 
     def error(model):
@@ -172,7 +172,7 @@ def with_masses(arm, factor):
 
 @pytest.mark.parametrize("factor", [0.01, 0.15])
 def test_placeholder_masses_warn(factor):
-    arm = Arm()
+    arm = Arm("acrobot", n_groups=1)
     with pytest.warns(ConvergenceWarning, match="model does not fit the torques"):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
 
@@ -180,7 +180,7 @@ def test_placeholder_masses_warn(factor):
 @pytest.mark.parametrize("n_inducing", [0, 5])
 @pytest.mark.parametrize("scale", [0.0, 1e-100, 1.0])
 def test_torques_that_are_the_models_own(scale, n_inducing):
-    arm = Arm("cartpole")
+    arm = Arm("cartpole", dt=0.2)
     body = RigidBodyRegressor("cartpole")
     y = scale * (body.fit_transform(arm.X) @ body.coef_prior(2)[0])
     with warnings.catch_warnings():
@@ -245,7 +245,7 @@ def test_velocities_of_friction_lie_in_their_intervals(tmp_path):
 
 
 def test_uncertain_velocity_of_friction_widens_std_at_low_speed():
-    arm = Arm("pendulum", noise=0.5, n_groups=1)
+    arm = Arm("pendulum", noise=0.5, n_groups=1, dt=0.02)
     X = np.array([[0.0, 0.02, 0.0], [0.0, 2.0, 0.0]])
     std = {
         velocity: InverseDynamics("pendulum", n_inducing=0, stiction_velocity=velocity)
@@ -310,7 +310,8 @@ def test_torque_that_differs_from_move_to_move_makes_nothing_worse_than_physics(
 class Changing:
     """An acrobot whose offset, friction and gain differ from move to move."""
 
-    def __init__(self, offset, n_moves=16):
+    def __init__(self, offset, n_moves=16, dt=0.02):
+        self.dt = dt
         self.robot = load_robot("acrobot")
         self.scale = np.array([[offset], [0.03], [0.1], [0.01]])
         moves = [self.move(seed) for seed in range(n_moves)]
@@ -319,7 +320,7 @@ class Changing:
 
     def move(self, seed, load=0.0):
         """Return X and y of a move, in which gravity is larger in the first joint."""
-        X, rng = trajectory(2, seed), np.random.default_rng([seed, 1])
+        X, rng = trajectory(2, seed, dt=self.dt), np.random.default_rng([seed, 1])
         offset, viscous, coulomb, gain = self.scale * rng.normal(size=(4, 2))
         q, v, a = np.split(X, 3, axis=1)
         rigid = RigidBody(self.robot).forces(q, v, a)
@@ -457,9 +458,9 @@ def warnings_of(X, y, **data):
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_robot_at_rest_with_equal_rows_is_fitted():
-    X = np.repeat([0.1, 0.0, 0.0], 6) * np.ones((1000, 1))
+    X = np.repeat([0.1, 0.0, 0.0], 6) * np.ones((200, 1))
     y = RigidBodyRegressor("ur5").fit_transform(X) @ RigidBodyRegressor("ur5").fit(X).coef_prior(6)[0]
-    model = InverseDynamics("ur5", random_state=0).fit(X, y.round(2), groups=np.arange(1000) // 250)
+    model = InverseDynamics("ur5", random_state=0).fit(X, y.round(2), groups=np.arange(200) // 50)
     mean, std = model.predict(X[:1], return_std=True)
     assert_allclose(mean, y[:1], atol=0.02)
     assert ((std > 0.0) & (std < 1.0)).all()
@@ -478,7 +479,7 @@ def test_weaknesses_of_a_log_are_named():
     said = warnings_of(arm.X, arm.y * [1.0, -1.0], groups=arm.groups)
     assert any(one.startswith("Torques of ['q2'] have the opposite sign") for one in said)
     # A filter as long as a fifth of the log: few independent rows.
-    few = Arm("acrobot", error=0.05, n_groups=1)
+    few = Arm("acrobot", error=0.05, n_groups=1, dt=0.02)
     slow = np.apply_along_axis(np.convolve, 0, np.random.default_rng(0).normal(size=(549, 2)), np.ones(50), "valid")
     said = warnings_of(few.X, few.torque(few.X) + 0.1 * slow)
     assert any("Record more motion." in one for one in said)
