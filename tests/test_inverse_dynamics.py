@@ -113,7 +113,7 @@ def carrying(arm, model, seed, gains=1.0, mass=2.0):
     loaded = Arm(seed=seed)
     body = pinocchio.Inertia(mass, np.array([0.02, -0.03, 0.1]), 0.01 * np.eye(3))
     loaded.model.inertias[loaded.model.njoints - 1] += body
-    rng, X = np.random.default_rng(seed), trajectory(6, 1000 + seed)
+    rng, X = np.random.default_rng(seed), trajectory(6, 1000 + seed, dt=0.05)
     clean = gains * loaded.torque(X)
     return model.estimate_payload(X, clean + 0.02 * clean.std(axis=0) * rng.normal(size=clean.shape)), body
 
@@ -310,7 +310,7 @@ def test_torque_that_differs_from_move_to_move_makes_nothing_worse_than_physics(
 class Changing:
     """An acrobot whose offset, friction and gain differ from move to move."""
 
-    def __init__(self, offset, n_moves=16, dt=0.02):
+    def __init__(self, offset, n_moves=16, dt=0.05):
         self.dt = dt
         self.robot = load_robot("acrobot")
         self.scale = np.array([[offset], [0.03], [0.1], [0.01]])
@@ -348,11 +348,11 @@ def test_update_lowers_the_error_of_the_rest_of_a_move(changing, fitted):
     assert_allclose(fitted.move_, 0.0)
     for seed in range(100, 110):
         X, y = changing.move(seed)
-        before, wide = fitted.predict(X[150:], return_std=True)
-        after, narrow = copy.deepcopy(fitted).update(X[:150], y[:150]).predict(X[150:], return_std=True)
-        squares.append([np.mean((torque - y[150:]) ** 2, axis=0) for torque in (before, after)])
+        before, wide = fitted.predict(X[60:], return_std=True)
+        after, narrow = copy.deepcopy(fitted).update(X[:60], y[:60]).predict(X[60:], return_std=True)
+        squares.append([np.mean((torque - y[60:]) ** 2, axis=0) for torque in (before, after)])
         assert (narrow < wide).all()
-        assert np.mean(((after - y[150:]) / narrow) ** 2) < 2.0
+        assert np.mean(((after - y[60:]) / narrow) ** 2) < 2.0
     first, rest = np.sqrt(np.mean(squares, axis=0))
     assert (rest < 0.5 * first).all()
 
@@ -412,7 +412,7 @@ def test_ordinary_logs_fail_the_check_as_often_as_stated_and_loads_are_found():
     model = machine.fit()
 
     def check(log, rate):
-        return model.check_log(*log, dt=0.02, false_alarms_per_minute=rate)
+        return model.check_log(*log, dt=machine.dt, false_alarms_per_minute=rate)
 
     # A log has 10 s, so that a rate of 0.6 a minute is a probability of 0.1.
     checks = [check(machine.move(seed), 0.6) for seed in range(300, 380)]
@@ -431,10 +431,10 @@ def test_ordinary_logs_fail_the_check_as_often_as_stated_and_loads_are_found():
 
 
 def test_shift_that_hardly_changes_the_size_of_errors_does_not_fit():
-    machine = Changing(0.005)
+    machine = Changing(0.005, dt=0.02)
     model = machine.fit()
     logs = [machine.move(seed) for seed in range(400, 405)]
-    checks = [model.check_log(X, y + [0.0, 0.1], dt=0.02) for X, y in logs]  # as large as the noise
+    checks = [model.check_log(X, y + [0.0, 0.1], dt=machine.dt) for X, y in logs]  # as large as the noise
     assert [one.joints for one in checks] == 5 * [["q2"]]
 
 
@@ -458,9 +458,9 @@ def warnings_of(X, y, **data):
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_robot_at_rest_with_equal_rows_is_fitted():
-    X = np.repeat([0.1, 0.0, 0.0], 6) * np.ones((200, 1))
+    X = np.repeat([0.1, 0.0, 0.0], 6) * np.ones((40, 1))
     y = RigidBodyRegressor("ur5").fit_transform(X) @ RigidBodyRegressor("ur5").fit(X).coef_prior(6)[0]
-    model = InverseDynamics("ur5", random_state=0).fit(X, y.round(2), groups=np.arange(200) // 50)
+    model = InverseDynamics("ur5", random_state=0).fit(X, y.round(2), groups=np.arange(40) // 10)
     mean, std = model.predict(X[:1], return_std=True)
     assert_allclose(mean, y[:1], atol=0.02)
     assert ((std > 0.0) & (std < 1.0)).all()
