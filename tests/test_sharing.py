@@ -33,7 +33,9 @@ def assert_same(one, other, X_NEW=X_NEW):
     assert one.lower_bound_ == other.lower_bound_
 
 
-@pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)], ids=["GP", "features"])
+@pytest.mark.parametrize(
+    "feature_map", [pytest.param(None, marks=pytest.mark.long), PolynomialFeatures(1)], ids=["GP", "features"]
+)
 @pytest.mark.parametrize(
     ("sharing", "other"),
     [
