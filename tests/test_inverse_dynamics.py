@@ -61,7 +61,7 @@ class Arm:
 
 @pytest.fixture(scope="module")
 def arm():
-    return Arm()
+    return Arm(dt=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_joints_own_columns_tell_what_physics_missed():
 
 def carrying(arm, model, seed, gains=1.0, mass=2.0):
     """What a model of the arm says that it carries, and what it does carry."""
-    loaded = Arm(seed=seed)
+    loaded = Arm(seed=seed, n_groups=1)
     body = pinocchio.Inertia(mass, np.array([0.02, -0.03, 0.1]), 0.01 * np.eye(3))
     loaded.model.inertias[loaded.model.njoints - 1] += body
     rng, X = np.random.default_rng(seed), trajectory(6, 1000 + seed, dt=0.05)
@@ -467,7 +467,7 @@ def test_robot_at_rest_with_equal_rows_is_fitted():
 
 
 def test_weaknesses_of_a_log_are_named():
-    arm = Arm("acrobot", error=0.05)
+    arm = Arm("acrobot", error=0.05, dt=0.1)
     assert warnings_of(arm.X, arm.y, groups=arm.groups) == []
     still = arm.X.copy()
     still[:, [1, 3, 5]] = [0.3, 0.0, 0.0]
