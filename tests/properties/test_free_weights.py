@@ -91,8 +91,8 @@ def test_what_features_represent_is_added_to_predictions(seed, feature_map, size
 
 
 def test_temperature_in_kelvin_is_forecast_from_its_trend():
-    x = np.linspace(0.0, 10.0, 80)[:, np.newaxis]
-    waves = 4.0 * np.sin(0.8 * np.pi * x[:, 0]) + 0.3 * np.random.default_rng(0).standard_normal(80)
+    x = np.linspace(0.0, 10.0, 200)[:, np.newaxis]
+    waves = 4.0 * np.sin(0.8 * np.pi * x[:, 0]) + 0.3 * np.random.default_rng(0).standard_normal(200)
     mean, std = (
         EVGPRegressor(LINE, random_state=0).fit(x, 290.0 + 0.8 * x[:, 0] + waves).predict([[12.0]], return_std=True)
     )
