@@ -232,12 +232,15 @@ def learned_cases(draw, most_outputs=3, known_maps=False, given_maps=None):
 
 @st.composite
 def learned_models(draw, X, o, known_maps=False, given_maps=None):
-    """Models that learn kernel, noise and inducing points, for a few iterations."""
+    """Models that learn kernel, noise and inducing points.
+
+    The fewest iterations with which fits and noise scales of Student-t noise alternate are three.
+    """
     given = draw(maps(o, known_maps) if given_maps is None else given_maps)
     kernel = draw(st.one_of(st.none(), kernels(X.shape[1])))
     parameters = {**given, "kernel": kernel, "normalize_y": draw(st.booleans()), "random_state": 0}
     if draw(st.integers(0, 4)) == 4:
-        return EGPRegressor(**parameters, max_iter=4)
+        return EGPRegressor(**parameters, max_iter=3)
     own = has_rows_of_outputs(given)
     parameters |= {"sharing": draw(sharings(o, own)), "n_inducing": draw(st.sampled_from([1, 5, 40]))}
     posterior = draw(st.sampled_from(["full", "diagonal"]))
@@ -257,7 +260,7 @@ def learned_models(draw, X, o, known_maps=False, given_maps=None):
         parameters["solver"] = Adam(batch_size=10, natural_gradient=True, bound=bound)
     elif kind == "restarts":
         parameters["solver"] = LBFGS(n_restarts=1, posterior=posterior, bound=bound)
-    return EVGPRegressor(**parameters, max_iter=4)
+    return EVGPRegressor(**parameters, max_iter=3)
 
 
 # --- What is compared.

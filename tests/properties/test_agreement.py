@@ -88,7 +88,7 @@ def test_casadi_predicts(case, include_noise, parametric):
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
-@fewer(5)
+@fewer(4)
 @given(fixed_cases(known_maps=True, smooth=True))
 def test_c_predicts(case):
     model = case.fitted()
@@ -112,6 +112,7 @@ def test_c_predicts(case):
         assert_near(results[3], of_variance, size**2, 1e-6)
 
 
+@fewer(2)
 @given(st.one_of(fixed_cases(known_maps=True), learned_cases(known_maps=True)))
 def test_files_and_pickles_hold_the_model_to_the_bit(case):
     model = case.fitted()

@@ -122,7 +122,7 @@ def test_nasty_data_are_fitted_or_refused(rows, nasty, draws):
     assert_fitted_or_refused(draws.draw(learned_models(X, Y.shape[1])), X, Y, contain)
 
 
-@fewer(2)
+@fewer(4)
 @given(
     NASTY,
     st.sampled_from([1, 2, 3, 20, 60]),
