@@ -20,7 +20,7 @@ def torque(X, size):
 
 def fit(sizes, seed=0, **options):
     """Fit a pendulum with one move for each size of the gear's torque."""
-    X = np.concatenate([trajectory(1, 100 * seed + move, dt=0.1) for move in range(len(sizes))])
+    X = np.concatenate([trajectory(1, 100 * seed + move, dt=0.05) for move in range(len(sizes))])
     moves = np.repeat(np.arange(len(sizes)), len(X) // len(sizes))
     y = torque(X, np.array(sizes)[moves]) + 0.1 * np.random.default_rng(seed).normal(size=len(X))
     return InverseDynamics("pendulum", random_state=0, **options).fit(X, y, groups=moves)

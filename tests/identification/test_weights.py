@@ -38,9 +38,9 @@ def test_intervals_hold_the_truth_of_correlated_rows():
     """The mean of eight neighbours as noise: rows say an eighth of what as many independent ones do."""
     rng, inside, naive = np.random.default_rng(0), [], []
     for seed in range(40):
-        rows, prior, beta = problem(n=800, noise=0.0, seed=seed)
-        slow = np.repeat(rng.normal(size=(100, 2, 4)), 8, axis=0)
-        noise = np.apply_along_axis(np.convolve, 0, rng.normal(size=(807, 2)), np.full(8, 0.125), mode="valid")
+        rows, prior, beta = problem(n=1600, noise=0.0, seed=seed)
+        slow = np.repeat(rng.normal(size=(200, 2, 4)), 8, axis=0)
+        noise = np.apply_along_axis(np.convolve, 0, rng.normal(size=(1607, 2)), np.full(8, 0.125), mode="valid")
         rows = replace(rows, features=slow, targets=slow @ beta + noise)
         found = identify(rows, prior)
         distance = np.abs(found.mean - beta) / np.sqrt(np.diag(found.covariance))
