@@ -42,7 +42,7 @@ Z_DRAWN = np.random.RandomState(3).randn(40, 2)
 # A fit of these options ends soon, and without a warning.
 ROUGH = {"solver": LBFGS(tol=5.0), "sharing": "all"}
 GIVEN = {"kernel": FIXED, "max_iter": 0}
-ALL_TRIED = theta_module._TRIED
+ALL_TRIED, ALL_IMPROVED = theta_module._TRIED, theta_module._IMPROVED
 
 
 @pytest.fixture(autouse=True)
@@ -50,6 +50,7 @@ def few_starts(request, monkeypatch):
     """Trials of starts would take half of a small fit. Long tests have all of them."""
     if request.node.get_closest_marker("long") is None:
         monkeypatch.setattr(theta_module, "_TRIED", 8)
+        monkeypatch.setattr(theta_module, "_IMPROVED", 1)
 
 
 def sparse(features=WAVE, **options):
@@ -163,6 +164,7 @@ def test_frequency_without_slope_at_its_median_is_learned():
 def test_best_of_several_optima_is_found(monkeypatch):
     """From the prior median, a local search ends in another wave."""
     monkeypatch.setattr(theta_module, "_TRIED", ALL_TRIED)
+    monkeypatch.setattr(theta_module, "_IMPROVED", ALL_IMPROVED)
     y = 2.0 * wave(X, 1.2, 0.2) + 0.05 * Z_DRAWN[:, 0]
     model = sparse(ParametricFeatures(wave, PRIORS | {"period": Uniform(0.8, 4.0)}), **ROUGH).fit(X, y)
     assert model.theta_["period"] == pytest.approx(1.2, abs=0.01)
