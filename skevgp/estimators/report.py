@@ -88,7 +88,7 @@ class FeatureReport:
     >>> from sklearn.preprocessing import PolynomialFeatures
     >>> from skevgp import EVGPRegressor, feature_report
     >>> from skevgp.datasets import make_toy
-    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> X, y = make_toy(60, random_state=0, return_X_y=True)
     >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
     >>> print(feature_report(model).groups[0])
     features: pass X and y to see whether the features help.
@@ -203,15 +203,17 @@ def feature_report(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from sklearn.preprocessing import FunctionTransformer
     >>> from skevgp import EVGPRegressor, feature_report
-    >>> from skevgp.datasets import make_dynamics
-    >>> from skevgp.features import InertiaForceGravity
-    >>> data = make_dynamics("pendulum", 20, 25, noise=0.01, random_state=1)
-    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=20, random_state=0)
-    >>> model = model.fit(data.data, data.target, groups=data.groups)
-    >>> report = feature_report(model, data.data, data.target, groups=data.groups)
-    >>> {one.group: one.verdict for one in report.groups}["all features"]
-    'helps'
+    >>> angle = np.linspace(0.0, 30.0, 80)[:, np.newaxis]
+    >>> torque = 5.0 * np.sin(angle[:, 0]) + 0.1 * np.random.default_rng(0).standard_normal(80)
+    >>> turns = np.arange(80) // 10  # each ten rows are a trajectory
+    >>> gravity = FunctionTransformer(np.sin)
+    >>> model = EVGPRegressor(gravity, n_inducing=5, random_state=0).fit(angle, torque, groups=turns)
+    >>> report = feature_report(model, angle, torque, groups=turns, n_splits=2)
+    >>> {one.group: one.verdict for one in report.groups}
+    {'features': 'helps', 'all features': 'helps'}
     """
     check_fitted(model)
     if not isinstance(model, GaussianProcess):

@@ -172,7 +172,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     >>> X = np.column_stack([q, dq, np.gradient(dq, t)])
     >>> torque = X[:, 2] / 4 + 9.81 / 2 * np.sin(q) + 0.1 * dq + 0.3 * np.tanh(dq / 0.01)
     >>> y = torque + 0.05 * np.random.default_rng(0).standard_normal(len(t))
-    >>> model = InverseDynamics(perturb_robot("pendulum", random_state=0), random_state=0).fit(X, y)
+    >>> robot = perturb_robot("pendulum", random_state=0)
+    >>> model = InverseDynamics(robot, n_inducing=10, random_state=0).fit(X, y)
     >>> mean, std = model.predict(X, return_std=True)
     >>> round(model.score(X, y), 3)
     1.0

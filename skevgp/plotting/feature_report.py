@@ -42,9 +42,9 @@ class FeatureReportDisplay:
     >>> from skevgp import EVGPRegressor, feature_report
     >>> from skevgp.datasets import make_toy
     >>> from skevgp.plotting import FeatureReportDisplay
-    >>> X, y = make_toy(random_state=0, return_X_y=True)
-    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
-    >>> FeatureReportDisplay.from_report(feature_report(model, X, y)).names
+    >>> X, y = make_toy(60, random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=5, random_state=0).fit(X, y)
+    >>> FeatureReportDisplay.from_report(feature_report(model, X, y, n_splits=2)).names
     ['features', 'all features']
     """
 

@@ -50,9 +50,9 @@ class LearningCurveDisplay:
     >>> from skevgp.datasets import make_dynamics
     >>> from skevgp.features import InertiaForceGravity
     >>> from skevgp.plotting import LearningCurveDisplay
-    >>> train, test = (make_dynamics("pendulum", 4, 50, random_state=seed) for seed in (0, 1))
+    >>> train, test = (make_dynamics("pendulum", 4, 10, random_state=seed) for seed in (0, 1))
     >>> display = LearningCurveDisplay.from_estimator(
-    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0),
+    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=5, random_state=0),
     ...     *(train.data, train.target, test.data, test.target),
     ...     sizes=[1, 4],
     ...     groups=train.groups,
@@ -60,7 +60,7 @@ class LearningCurveDisplay:
     ...     random_state=0,
     ... )
     >>> display.n_rows, display.scores.shape
-    (array([ 50., 200.]), (2, 2))
+    (array([10., 40.]), (2, 2))
     """
 
     def __init__(self, n_rows: np.ndarray, scores: np.ndarray, score_name: str = "prediction error"):

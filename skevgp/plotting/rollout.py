@@ -51,9 +51,10 @@ class RolloutDisplay:
     >>> from skevgp.datasets import make_dynamics
     >>> from skevgp.features import InertiaForceGravity
     >>> from skevgp.plotting import RolloutDisplay
-    >>> train, test = (make_dynamics("pendulum", n, random_state=s) for n, s in [(20, 0), (1, 1)])
+    >>> train, test = (make_dynamics("pendulum", n, random_state=s) for n, s in [(4, 0), (1, 1)])
     >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
-    >>> ahead = rollout(model.fit(train.data, train.target), test.data[0, :2], test.data[:50, 2:], random_state=0)
+    >>> model = model.fit(train.data, train.target, groups=train.groups)
+    >>> ahead = rollout(model, test.data[0, :2], test.data[:50, 2:], random_state=0)
     >>> truth = test.trajectories[0, 1:51]
     >>> display = RolloutDisplay.from_rollout(ahead, truth, state_names=test.target_names, dt=test.dt)
     >>> len(display.axes_)

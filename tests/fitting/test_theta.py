@@ -1,6 +1,7 @@
 """Parameters of feature maps: their posterior, and the model's predictions with it."""
 
 import warnings
+from functools import cache
 
 import autograd.numpy as anp
 import numpy as np
@@ -15,6 +16,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, feature_report
 from skevgp.exceptions import UnidentifiedWarning
 from skevgp.features import LogNormal, Normal, ParametricFeatures, Uniform
+from skevgp.fitting import theta as theta_module
 from skevgp.fitting.theta import map_at
 from skevgp.maps.theta import Theta
 from skevgp.noise import Gaussian
@@ -37,6 +39,18 @@ from ..theta import (
 X, Y = data()
 X_NEW = np.random.RandomState(9).uniform(-1.0, 6.0, (7, 2))
 Z_DRAWN = np.random.RandomState(3).randn(40, 2)
+# A fit of these options ends soon, and without a warning.
+ROUGH = {"solver": LBFGS(tol=5.0), "sharing": "all"}
+GIVEN = {"kernel": FIXED, "max_iter": 0}
+ALL_TRIED, ALL_IMPROVED = theta_module._TRIED, theta_module._IMPROVED
+
+
+@pytest.fixture(autouse=True)
+def few_starts(request, monkeypatch):
+    """Trials of starts would take half of a small fit. Long tests have all of them."""
+    if request.node.get_closest_marker("long") is None:
+        monkeypatch.setattr(theta_module, "_TRIED", 8)
+        monkeypatch.setattr(theta_module, "_IMPROVED", 1)
 
 
 def sparse(features=WAVE, **options):
@@ -129,8 +143,9 @@ def test_parameters_of_a_linear_function_are_weights(exact, n_outputs, weighted,
 @pytest.mark.parametrize("shared", [False, True])
 def test_points_at_all_rows_give_exact_model(shared, discrepancy):
     options = {"kernel": FIXED, "max_iter": 0, "coef_prior": CoefPrior(0.0, 2.0, shared=shared)}
-    one = with_all_points(discrepancy=discrepancy, **options).fit(X, Y)
-    other = EGPRegressor(WAVE, discrepancy=discrepancy, random_state=0, **options).fit(X, Y)
+    rows, y = X[::2], Y[::2]
+    one = with_all_points(discrepancy=discrepancy, inducing_init=rows, **options).fit(rows, y)
+    other = EGPRegressor(WAVE, discrepancy=discrepancy, random_state=0, **options).fit(rows, y)
     assert_same_theta(one, other, 1e-3)
     for found, expected in zip(one.predict(X_NEW, True), other.predict(X_NEW, True), strict=True):
         assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
@@ -142,14 +157,16 @@ def test_frequency_without_slope_at_its_median_is_learned():
         return anp.cos(w * X[:, 0])
 
     y = 2.0 * np.cos(1.5 * X[:, 0]) + 0.05 * Z_DRAWN[:, 0]
-    model = sparse(ParametricFeatures(cosine, {"w": Normal(0.0, 1.0)})).fit(X, y)
+    model = sparse(ParametricFeatures(cosine, {"w": Normal(0.0, 1.0)}), **GIVEN).fit(X, y)
     assert abs(model.theta_["w"]) == pytest.approx(1.5, abs=0.02)
 
 
-def test_best_of_several_optima_is_found():
+def test_best_of_several_optima_is_found(monkeypatch):
     """From the prior median, a local search ends in another wave."""
+    monkeypatch.setattr(theta_module, "_TRIED", ALL_TRIED)
+    monkeypatch.setattr(theta_module, "_IMPROVED", ALL_IMPROVED)
     y = 2.0 * wave(X, 1.2, 0.2) + 0.05 * Z_DRAWN[:, 0]
-    model = sparse(ParametricFeatures(wave, PRIORS | {"period": Uniform(0.8, 4.0)})).fit(X, y)
+    model = sparse(ParametricFeatures(wave, PRIORS | {"period": Uniform(0.8, 4.0)}), **ROUGH).fit(X, y)
     assert model.theta_["period"] == pytest.approx(1.2, abs=0.01)
 
 
@@ -178,9 +195,14 @@ NESTED = {
 }
 
 
+@cache
+def of_two_columns():
+    return sparse(TWO_COLUMNS, **FIXED_WEIGHTS).fit(X, Y)
+
+
 @pytest.mark.parametrize("name", NESTED)
 def test_nested_maps_are_one_function(name):
-    expected = sparse(TWO_COLUMNS, **FIXED_WEIGHTS).fit(X, Y)
+    expected = of_two_columns()
     model = sparse(NESTED[name], **FIXED_WEIGHTS).fit(X, Y)
     assert model.theta_ == pytest.approx(expected.theta_, rel=1e-6)
     assert model.theta_std_ == pytest.approx(expected.theta_std_, rel=1e-6)
@@ -206,7 +228,7 @@ def test_parameters_of_the_same_name_get_those_of_their_parts():
     union = make_union(WAVE, DECAY, ParametricFeatures(decay, {"rate": LogNormal(2.0, 0.1)}))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnidentifiedWarning)
-        model = sparse(union).fit(X, Y[:, 0])
+        model = sparse(union, **GIVEN).fit(X, Y[:, 0])
     assert list(model.theta_) == ["period", "phase", "parametricfeatures-2__rate", "parametricfeatures-3__rate"]
 
 
@@ -255,14 +277,15 @@ def test_warm_start_goes_on_from_the_last_parameters():
 def test_parameters_do_not_move_under_a_guess_of_the_noise(make):
     """Without a fit of kernel and noise, θ is the best for the features alone."""
     options = {"optimizer": None} if make is EGPRegressor else {"max_iter": 0}
-    model, whole = make(WAVE, **options).fit(X, Y[:, 0]), make(WAVE).fit(X, Y[:, 0])
+    rough = {} if make is EGPRegressor else ROUGH
+    model, whole = make(WAVE, **options).fit(X, Y[:, 0]), make(WAVE, **rough).fit(X, Y[:, 0])
     for name, value in whole.theta_.items():
         assert model.theta_[name] == pytest.approx(value, abs=5.0 * whole.theta_std_[name] + 0.02)
 
 
 @pytest.mark.parametrize("make", [sparse, EGPRegressor])
 def test_report_on_features_with_parameters(make):
-    model = make(WAVE).fit(X, Y[:, 0])
+    model = make(WAVE, **GIVEN).fit(X, Y[:, 0])
     (group, everything) = feature_report(model, X, Y[:, 0], n_splits=2).groups
     assert everything.n_weights == group.n_weights == model.coef_.shape[-1]
 
@@ -276,7 +299,7 @@ OPTIONS = {
     "apart": {"sharing": "none"},
     "groups": {"sharing": [[1], [0]]},
     "found": {"sharing": "auto"},
-    "tight": {"solver": LBFGS(bound="tight")},
+    "tight": {"solver": LBFGS(bound="tight", tol=5.0)},
     "learned scales": {"coef_prior": CoefPrior(0.0, 3.0, groups=["w"])},
     "warm": {"warm_start": True},
     "orthogonal": {"discrepancy": "orthogonal"},
@@ -286,7 +309,7 @@ OPTIONS = {
 @pytest.mark.parametrize("name", OPTIONS)
 def test_options_keep_theta(name):
     groups = np.arange(40) // 4 if name == "folds" else None
-    model = sparse(**OPTIONS[name]).fit(X, Y, groups=groups)
+    model = sparse(**ROUGH | OPTIONS[name]).fit(X, Y, groups=groups)
     if name == "warm":
         model.fit(X, Y)
     theta, std = np.array(list(model.theta_.values())), np.array(list(model.theta_std_.values()))
@@ -429,7 +452,7 @@ def test_wide_prior_makes_orthogonal_f_the_projection_of_a_free_one():
 
 
 def test_orthogonal_f_without_features_is_free():
-    one, other = (sparse(None, discrepancy=kind).fit(X, Y) for kind in ("free", "orthogonal"))
+    one, other = (sparse(None, discrepancy=kind, **ROUGH).fit(X, Y) for kind in ("free", "orthogonal"))
     for found, expected in zip(one.predict(X_NEW, True), other.predict(X_NEW, True), strict=True):
         assert_allclose(found, expected, rtol=1e-9)
 
@@ -489,7 +512,7 @@ def test_parameter_at_the_edge_of_its_prior_warns():
 @pytest.mark.parametrize("prior", ["auto", CoefPrior(mean=[2.0], scale=0)], ids=["free", "fixed"])
 def test_parameter_far_outside_of_its_prior_warns_by_name(prior):
     """The frequency is 1.5. A prior scale of 0 is the user's choice, and no reason for another warning."""
-    rows = np.random.RandomState(0).uniform(-3.0, 3.0, (100, 1))
+    rows = np.random.RandomState(0).uniform(-3.0, 3.0, (30, 1))
     features = ParametricFeatures(lambda X, frequency: anp.sin(frequency * X), {"frequency": LogNormal(1.0, 0.1)})
     with pytest.warns(ConvergenceWarning) as caught:
         model = EGPRegressor(features, coef_prior=prior).fit(rows, 2.0 * np.sin(1.5 * rows[:, 0]))
@@ -499,15 +522,15 @@ def test_parameter_far_outside_of_its_prior_warns_by_name(prior):
 
 def test_theta_of_another_model_is_explained():
     with pytest.raises(AttributeError, match="theta_ only after a fit with a feature_map that has parameters"):
-        _ = sparse(FunctionTransformer()).fit(X, Y).theta_
-    model = sparse().fit(X, Y).set_params(feature_map=FunctionTransformer()).fit(X, Y)
+        _ = sparse(FunctionTransformer(), **GIVEN).fit(X, Y).theta_
+    model = sparse(**GIVEN).fit(X, Y).set_params(feature_map=FunctionTransformer()).fit(X, Y)
     assert not hasattr(model, "theta_std_")
 
 
 def test_values_of_parameters_stay_within_their_map():
     """The map that the user gave is not changed, and that of the fit has the posterior's values."""
     given = ParametricFeatures(wave, PRIORS)
-    model = sparse(given).fit(X, Y)
+    model = sparse(given, **ROUGH).fit(X, Y)
     assert not hasattr(given, "theta_")
     own = Theta.of(model.feature_map_)
     assert own.names == ("period", "phase")

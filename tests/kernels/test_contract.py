@@ -42,14 +42,14 @@ def test_values_are_those_of_the_scikit_learn_kernel(name, centre):
 @pytest.mark.parametrize("name", KERNELS)
 def test_gradients_agree_with_finite_differences(name, centre):
     covariance, hyperparameters = parsed(KERNELS[name], centre)
-    bars, p = random_bars(7, 40), len(hyperparameters)
+    points, bars, p = Z[:4], random_bars(4, 40), len(hyperparameters)
 
     def value(flat):
-        return scalar(covariance, np.exp(flat[:p]), flat[p:].reshape(7, 2), X, bars)
+        return scalar(covariance, np.exp(flat[:p]), flat[p:].reshape(4, 2), X, bars)
 
-    hyper_bar, Z_bar = pulled_back(covariance, hyperparameters, Z, X, bars)
+    hyper_bar, Z_bar = pulled_back(covariance, hyperparameters, points, X, bars)
     actual = np.concatenate([hyper_bar, Z_bar.ravel()])
-    expected = central_differences(value, np.concatenate([np.log(hyperparameters), Z.ravel()]), 1e-5)
+    expected = central_differences(value, np.concatenate([np.log(hyperparameters), points.ravel()]), 1e-5)
     assert np.abs(actual - expected).max() < 1e-7 * max(np.abs(expected).max(), 1.0)
 
 
@@ -237,7 +237,7 @@ def test_slopes_agree_with_differences_of_the_scikit_learn_kernel(name, centre):
 def test_mixed_slopes_agree_with_differences_of_slopes(name, centre):
     covariance, hyperparameters = parsed(KERNELS[name], centre)
     actual = covariance.at(hyperparameters, Z).mixed_slopes(covariance.prepare(X))
-    for row, own in zip(X[:10], actual, strict=False):
+    for row, own in zip(X[:4], actual, strict=False):
         # ∂k(z, x)/∂x at x = row, as a function of z.
         expected = differences(
             lambda points, x=row: (
