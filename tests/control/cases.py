@@ -12,7 +12,7 @@ from skevgp.solvers import LBFGS
 from ..theta import rows_of_three
 
 N_OUTPUTS, D = 3, 2
-QUICK = {"max_iter": 10, "solver": LBFGS(tol=1e6), "random_state": 0}
+QUICK = {"max_iter": 10, "solver": LBFGS(tol=1e6), "sharing": "all", "random_state": 0}
 
 
 def quick(model):
@@ -36,25 +36,30 @@ def shrunk(X):
 
 KERNEL = ConstantKernel(2.0) * RBF([0.9, 1.2])
 MODELS = {
-    "plain": EVGPRegressor(n_inducing=20),
-    "a group each": EVGPRegressor(PolynomialFeatures(2), sharing=[[0, 2], [1]], n_inducing=15),
+    "plain": EVGPRegressor(n_inducing=12),
+    "a group each": EVGPRegressor(PolynomialFeatures(2), sharing=[[0, 2], [1]], n_inducing=10),
     "diagonal": EVGPRegressor(
-        PolynomialFeatures(1), KERNEL, solver=LBFGS(posterior="diagonal"), sharing="kernel", n_inducing=15
+        PolynomialFeatures(1), KERNEL, solver=LBFGS(posterior="diagonal"), sharing="kernel", n_inducing=10
     ),
     "maps": EVGPRegressor(
         make_union(PolynomialFeatures(2), StandardScaler()),
         kernel_map=make_pipeline(StandardScaler(), PolynomialFeatures(2, include_bias=False)),
-        n_inducing=20,
+        sharing="all",
+        n_inducing=12,
         normalize_y=True,
     ),
-    "foreign maps": EVGPRegressor(FunctionTransformer(np.sinh), kernel_map=FunctionTransformer(shrunk), n_inducing=20),
+    "foreign maps": EVGPRegressor(
+        FunctionTransformer(np.sinh), kernel_map=FunctionTransformer(shrunk), sharing="all", n_inducing=12
+    ),
     "rows per output": EVGPRegressor(
-        FunctionTransformer(own_features), kernel_map=FunctionTransformer(own_columns), n_inducing=20
+        FunctionTransformer(own_features), kernel_map=FunctionTransformer(own_columns), sharing="none", n_inducing=12
     ),
     "shared weights": EVGPRegressor(
-        FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), n_inducing=20
+        FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), sharing="kernel", n_inducing=12
     ),
-    "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), n_inducing=20),
+    "not stationary": EVGPRegressor(
+        kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), sharing="all", n_inducing=12
+    ),
     "parameters": EVGPRegressor(ParametricFeatures(rows_of_three, {"scale": Uniform(0.5, 3.0)}), n_inducing=10),
     "exact": EGPRegressor(PolynomialFeatures(1)),
 }

@@ -18,7 +18,7 @@ pytestmark = [
     pytest.mark.skipif(COMPILER is None, reason="there is no C compiler"),
     pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning"),
 ]
-WARNINGS = ["-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror"]
+WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 SHAPES = {
     "predict": ("mean", "variance"),
     "mean_jacobian": ("mean", "mean_jacobian"),
@@ -26,9 +26,9 @@ SHAPES = {
 }
 
 
-def compiled(source, *options):
+def compiled(source, optimise="-O0"):
     library = source.with_suffix(".so")
-    command = [COMPILER, *WARNINGS, "-shared", "-fPIC", "-o", library, source, *options, "-lm"]
+    command = [COMPILER, *WARNINGS, "-shared", "-fPIC", "-o", library, source, optimise, "-lm"]
     subprocess.run(list(map(str, command)), check=True, capture_output=True, text=True)
     return library
 
@@ -49,7 +49,7 @@ def called(library, name, x, n_outputs, which="jacobian", without=()):
 
 @pytest.mark.parametrize("name", ["no maps", "cartpole", "groups", "rows of both", "sums", "exact, features"])
 def test_c_predicts(name, tmp_path):
-    model = fitted(MODELS[name])
+    model = fitted(MODELS[name], n_rows=30)
     source, header = model.to_c(tmp_path)
     assert (source, header) == (tmp_path / "evgp.c", tmp_path / "evgp.h")
     assert f"skevgp {skevgp.__version__} with CasADi {ca.CasadiMeta.version()}" in header.read_text()
@@ -86,7 +86,7 @@ def test_c_predicts_rows_that_end_with_their_time_step(tmp_path):
 def exported(tmp_path_factory):
     """A model, and its library."""
     model = fitted(sparse(POLYNOMIAL, sharing="all"))
-    return model, compiled(model.to_c(tmp_path_factory.mktemp("c"), "arm", include_noise=False)[0])
+    return model, compiled(model.to_c(tmp_path_factory.mktemp("c"), "arm", include_noise=False)[0], "-O1")
 
 
 def test_noise_is_left_out_if_that_is_asked_for(exported):

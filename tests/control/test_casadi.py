@@ -1,4 +1,5 @@
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,8 +12,13 @@ from skevgp.kernels import FunctionKernel
 
 from .export_cases import MODELS, POLYNOMIAL, data, evaluated, fitted, jacobians, predicted, sparse
 
-each_model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+each_model = pytest.mark.parametrize("name", MODELS)
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+@cache
+def case(name):
+    return fitted(clone(MODELS[name]))
 
 
 def assert_same(found, model, X, include_noise=True):
@@ -25,24 +31,24 @@ def assert_same(found, model, X, include_noise=True):
 
 
 @each_model
-def test_function_predicts(model):
-    model = fitted(clone(model))
+def test_function_predicts(name):
+    model = case(name)
     X, _ = data(seed=1)
     for include_noise in (True, False):
         assert_same(evaluated(model.to_casadi(include_noise=include_noise), X[:20]), model, X[:20], include_noise)
 
 
 @each_model
-def test_function_of_parameters_predicts(model):
-    model = fitted(clone(model))
+def test_function_of_parameters_predicts(name):
+    model = case(name)
     X, _ = data(seed=1)
     found = evaluated(model.to_casadi(parametric=True), X[:5], model.to_casadi_parameters())
     assert_same(found, model, X[:5])
 
 
 @each_model
-def test_jacobians_are_those_of_predict(model):
-    model = fitted(clone(model))
+def test_jacobians_are_those_of_predict(name):
+    model = case(name)
     function, h = model.to_casadi(), 1e-5
     for row in data(seed=1)[0][:2]:
         up, down = (predicted(model, row + sign * h * np.eye(len(row))) for sign in (1.0, -1.0))

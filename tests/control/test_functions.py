@@ -13,12 +13,12 @@ from skevgp.solvers import LBFGS
 from .cases import N_OUTPUTS, QUICK, D, own_features, quick
 from .test_derivatives import close, differences
 
-N, N_PATHS = 1500, 20_000
+N, N_PATHS = 800, 5000
 
 
 def test_functions_have_posterior_mean_and_covariance(model, data):
     X = data[2]
-    values = model.sample_functions(N, n_waves=1500)(X)
+    values = model.sample_functions(N, n_waves=1000)(X)
     assert values.shape == (N, len(X), N_OUTPUTS)
     mean, cov = model.predict(X, return_cov=True, include_noise=False)
     std = np.sqrt(np.einsum("nno->no", cov))
@@ -75,13 +75,17 @@ def test_same_seed_gives_the_same_functions_and_they_can_be_pickled(data):
 # --- along a path ----------------------------------------------------------------------------------------------------
 
 FOLLOWED = {
-    "plain": EVGPRegressor(n_inducing=8),
+    "plain": EVGPRegressor(sharing="all", n_inducing=8),
     "features": EVGPRegressor(PolynomialFeatures(1), sharing=[[0, 1], [2]], n_inducing=8, normalize_y=True),
     "diagonal": EVGPRegressor(
         PolynomialFeatures(1), solver=LBFGS(posterior="diagonal"), sharing="kernel", n_inducing=8
     ),
-    "shared weights": EVGPRegressor(FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), n_inducing=8),
-    "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=0.5), n_inducing=8),
+    "shared weights": EVGPRegressor(
+        FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), sharing="kernel", n_inducing=8
+    ),
+    "not stationary": EVGPRegressor(
+        kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=0.5), sharing="none", n_inducing=8
+    ),
     "exact": EGPRegressor(PolynomialFeatures(1)),
 }
 

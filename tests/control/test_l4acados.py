@@ -46,14 +46,14 @@ class Controller:
         return *map(np.array, zip(*found, strict=True)), self.residual_model.current_variance.flatten()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def rows():
     """Rows of two states and an input: to fit, and the stages of a plan."""
     rng = np.random.RandomState(0)
     return rng.uniform(-1.0, 1.0, (80, 3)), rng.uniform(-1.0, 1.0, (7, 3))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def model(rows):
     X, _ = rows
     return EVGPRegressor(n_inducing=20, **QUICK).fit(X, following(X))

@@ -22,7 +22,7 @@ from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
 N_STEPS = 12
-QUICK = {"max_iter": 20, "solver": LBFGS(tol=1e6), "random_state": 0}
+QUICK = {"max_iter": 20, "solver": LBFGS(tol=1e6), "sharing": "all", "random_state": 0}
 
 
 def plant(z, u):

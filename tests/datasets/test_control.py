@@ -44,7 +44,12 @@ def test_clamped_commands_equal_the_stored_ones(stored):
     assert_allclose(ends[:, 1], after, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("robot", ["iiwa14", "ur5", "panda", "kinova", "double_pendulum", "talos_left_arm"])
+OTHERS = ["iiwa14", "panda", "kinova", "talos_left_arm"]
+
+
+@pytest.mark.parametrize(
+    "robot", ["ur5", "double_pendulum", *(pytest.param(name, marks=pytest.mark.long) for name in OTHERS)]
+)
 def test_robot_arrives_at_its_target(robot):
     n = load_robot(robot).nv
     q0, q1 = np.zeros((2, n)), np.array([[0.02], [-0.02]]) * np.ones(n)

@@ -93,7 +93,11 @@ def test_joint_without_motor_is_swung_at_random():
 
 @pytest.mark.parametrize(
     ("name", "arguments", "joint"),
-    [("panda", {"dt": 0.1}, "finger"), ("so100", {"dt": 0.1}, "gripper"), ("panda", {"duration": 0.2}, "finger")],
+    [
+        pytest.param("panda", {"dt": 0.1}, "finger", marks=pytest.mark.long),
+        ("so100", {"dt": 0.1}, "gripper"),
+        ("panda", {"duration": 0.2}, "finger"),
+    ],
 )
 def test_moves_that_run_away_raise(name, arguments, joint):
     with pytest.raises(ValueError, match=rf"unstable in step \d+, at .*{joint}.*Lower dt"):

@@ -27,7 +27,7 @@ MASSLESS = {
     "romeo_laas_small": "l_gripper_joint",
 }
 # Prismatic and continuous joints, fingers, and joints that move no mass.
-QUICK = ("pendulum", "acrobot", "ur5", "panda", "double_pendulum_continuous", "falcon_bravo7_gripper", "romeo")
+QUICK = ("pendulum", "acrobot", "ur5", "panda", "double_pendulum_continuous", "falcon_bravo7_gripper")
 
 
 def marked(name):

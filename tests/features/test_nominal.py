@@ -250,6 +250,7 @@ def error(model, data):
     return prediction_error(test.target, model.fit(train.data, train.target).predict(test.data))
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:The bound was still rising")
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_invalid_model_and_encoded_angles_help_the_regressor():

@@ -305,6 +305,7 @@ def assert_found(model, expected, relative=0.1):
         assert model.theta_std_[name] < relative * abs(value), name
 
 
+@pytest.mark.long
 def test_fit_finds_wrong_mass_and_length():
     model = load_robot("acrobot").copy()
     first, second = model.inertias[1], model.inertias[2]
@@ -318,7 +319,7 @@ def test_fit_finds_wrong_mass_and_length():
     assert_found(fitted, {"length(q2)": 1.2, "mass(q1)": 1.2})
 
 
-@pytest.mark.parametrize("kind", ["sine", "levers"])
+@pytest.mark.parametrize("kind", ["sine", pytest.param("levers", marks=pytest.mark.long)])
 def test_fit_finds_the_offset_of_an_encoder(kind):
     offset, dt = 0.15, 0.01
     data = make_dynamics("pendulum", 8, 50, dt=dt, noise=0.002, random_state=0)
@@ -349,6 +350,7 @@ def test_fit_finds_the_numbers_of_friction():
     assert_found(fitted, {"stribeck_velocity": 0.3, "sharpness": 1.5}, 0.2)
 
 
+@pytest.mark.long
 def test_fit_finds_the_stiction_velocities_of_joints():
     rng = np.random.default_rng(0)
     X = rng.normal(size=(300, 6)) * [1.0, 1.0, 0.3, 0.3, 1.0, 1.0]

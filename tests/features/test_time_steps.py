@@ -263,7 +263,7 @@ def log(n_trajectories, n_steps, seed, shortest=0.005, longest=0.05):
 def model(features):
     """With or without features the kernel sees Δt."""
     encoder = AngleEncoder("pendulum", dt="column")
-    return EVGPRegressor(features, kernel_map=encoder, n_inducing=20, max_iter=60, random_state=0)
+    return EVGPRegressor(features, kernel_map=encoder, n_inducing=20, sharing="all", max_iter=60, random_state=0)
 
 
 def with_physics():
@@ -291,6 +291,7 @@ class TestLogs:
         assert physics[0] < 1.2 * plain[0]
         assert physics[1] < 0.6 * plain[1]
 
+    @pytest.mark.long
     def test_what_short_steps_tell_holds_for_long_ones(self):
         """Geometric mean of three logs: what a kernel alone says of longer steps is chance, and may be good."""
         ratios = []

@@ -25,7 +25,7 @@ def test_fit_does_not_depend_on_units(system, units):
     X, y = make_dynamics(system, 6, 25, noise=0.01, random_state=0, return_X_y=True)
     X_new, _ = make_dynamics(system, 3, 25, random_state=1, return_X_y=True)
     of_columns, of_targets = np.array(units), np.array(units[: y.shape[1]])
-    model = EVGPRegressor(InertiaForce(system), n_inducing=15, max_iter=20, random_state=0)
+    model = EVGPRegressor(InertiaForce(system), n_inducing=15, sharing="kernel", max_iter=10, random_state=0)
     mean, std = model.fit(X, y).predict(X_new, return_std=True)
     scale = model.coef_prior_scale_
     model.fit(X * of_columns, y * of_targets)

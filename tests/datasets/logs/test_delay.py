@@ -74,7 +74,9 @@ def simulated(path, robot, joints, delay, seed=0):
     return {"time": 0, **{name: range(1 + i * model.nv, 1 + (i + 1) * model.nv) for i, name in enumerate(signals)}}
 
 
-@pytest.mark.parametrize(("robot", "joints"), [("panda", ARM), ("acrobot", ["q1", "q2"])])
+@pytest.mark.parametrize(
+    ("robot", "joints"), [pytest.param("panda", ARM, marks=pytest.mark.long), ("acrobot", ["q1", "q2"])]
+)
 def test_delay_is_estimated_for_each_file(tmp_path, robot, joints):
     """Also if only some joints of the robot were recorded, in another order, with wrong masses."""
     delays, files = [0.0, 0.008, 0.023, -0.012], [tmp_path / f"{number}.csv" for number in range(4)]
