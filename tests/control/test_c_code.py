@@ -47,7 +47,10 @@ def called(library, name, x, n_outputs, which="jacobian", without=()):
     return results
 
 
-@pytest.mark.parametrize("name", ["no maps", "cartpole", "groups", "rows of both", "sums", "exact, features"])
+OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in ("no maps", "sums", "exact, features")]
+
+
+@pytest.mark.parametrize("name", ["cartpole", "groups", "rows of both", *OTHERS])
 def test_c_predicts(name, tmp_path):
     model = fitted(MODELS[name], n_rows=30)
     source, header = model.to_c(tmp_path)

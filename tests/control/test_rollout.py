@@ -22,7 +22,7 @@ from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
 N_STEPS = 12
-QUICK = {"max_iter": 20, "solver": LBFGS(tol=1e6), "sharing": "all", "random_state": 0}
+QUICK = {"max_iter": 5, "solver": LBFGS(tol=1e6), "sharing": "all", "noise_cv": None, "random_state": 0}
 
 
 def plant(z, u):
@@ -51,7 +51,7 @@ PULL = ParametricFeatures(pull, {"rate": LogNormal(0.8, 1.0)})
 REGRESSORS = {
     "sparse": EVGPRegressor(n_inducing=15, **QUICK),
     "features": EVGPRegressor(FunctionTransformer(), kernel_map=StandardScaler(), n_inducing=15, **QUICK),
-    "exact": EGPRegressor(FunctionTransformer(), random_state=0, max_iter=20, tol=1e6),
+    "exact": EGPRegressor(FunctionTransformer(), random_state=0, max_iter=5, tol=1e6),
     "parameters": EVGPRegressor(PULL, n_inducing=15, **QUICK),
     "residual of parameters": ResidualRegressor(EVGPRegressor(PULL, n_inducing=15, **QUICK)),
     "residual": ResidualRegressor(EVGPRegressor(n_inducing=15, **QUICK)),

@@ -34,9 +34,9 @@ def table_of(t):
 
 
 def write_table(path, table, header=HEADER, delimiter=","):
-    lines = [] if header is None else [delimiter.join(header)]
-    lines += [delimiter.join(f"{value:.12g}" for value in row) for row in table]
-    text = "\n".join(lines) + "\n"
+    row = delimiter.join(["%.12g"] * table.shape[1]) + "\n"
+    text = "" if header is None else delimiter.join(header) + "\n"
+    text += row * len(table) % tuple(table.ravel().tolist())
     with gzip.open(path, "wt") if path.suffix == ".gz" else path.open("w") as file:
         file.write(text)
     return path
