@@ -12,7 +12,7 @@ from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics, 
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
-from ..theta import WAVE, rows_of_three
+from ..theta import DECAY, WAVE, rows_of_three
 
 
 class Rows(TransformerMixin, BaseEstimator):
@@ -75,7 +75,7 @@ MODELS = {
     "sums": sparse(kernel=2.0 * sk.Matern(1.0, nu=1.5) + sk.DotProduct(0.5) + sk.WhiteKernel(0.1), noise="gaussian"),
     "parameters": sparse(make_union(WAVE, StandardScaler())),
     "parameters, rows": sparse(ParametricFeatures(rows_of_three, {"scale": Uniform(0.5, 3.0)})),
-    "parameters, orthogonal f": exact(WAVE, discrepancy="orthogonal"),
+    "parameters, orthogonal f": exact(DECAY, discrepancy="orthogonal"),
     "exact": exact(),
     "exact, features": exact(POLYNOMIAL, normalize_y=True),
     "exact, shared weights": exact(Rows(), coef_prior=CoefPrior(shared=True)),
