@@ -5,6 +5,8 @@ import pytest
 
 from skevgp.datasets import load_log
 
+from .cases import text_of
+
 T = np.arange(0.0, 20.0, 0.02)
 Q = np.column_stack([np.sin(T) + 0.3 * np.sin(2.7 * T), np.cos(1.4 * T) - 0.2 * np.sin(3.1 * T)])
 DQ = np.column_stack([np.cos(T) + 0.81 * np.cos(2.7 * T), -1.4 * np.sin(1.4 * T) - 0.62 * np.cos(3.1 * T)])
@@ -15,7 +17,7 @@ COLUMNS = {"time": 0, "position": [1, 2], "velocity": [3, 4], "effort": [5, 6]}
 def load(tmp_path):
     def load(q, dq, **arguments):
         file = tmp_path / "log.csv"
-        np.savetxt(file, np.column_stack([T, q, dq, q]), delimiter=",")
+        file.write_text(text_of(np.column_stack([T, q, dq, q])))
         return load_log(file, columns=COLUMNS, **arguments)
 
     return load
@@ -25,7 +27,7 @@ def load(tmp_path):
 def agreeing(tmp_path_factory):
     """The log of velocities that agree with positions."""
     file = tmp_path_factory.mktemp("agreeing") / "log.csv"
-    np.savetxt(file, np.column_stack([T, Q, DQ, Q]), delimiter=",")
+    file.write_text(text_of(np.column_stack([T, Q, DQ, Q])))
     return load_log(file, columns=COLUMNS)
 
 
@@ -86,7 +88,7 @@ def test_stamps_may_come_in_bursts(tmp_path):
     stamps = np.floor(t / 0.1) * 0.1 + np.arange(len(t)) % 10 * 2e-4
     file = tmp_path / "log.csv"
     for factor in (1.0, 3.0):
-        np.savetxt(file, np.column_stack([stamps, np.sin(t), factor * np.cos(t), t]), delimiter=",", fmt="%.9g")
+        file.write_text(text_of(np.column_stack([stamps, np.sin(t), factor * np.cos(t), t]), "%.9g"))
         columns = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
         if factor == 1.0:
             load_log(file, columns=columns, max_gap=0.5)
@@ -105,6 +107,6 @@ def test_delay_of_periodic_motion_is_the_shortest(load, seconds):
 
 def test_accelerometer_that_measures_gravity_too_is_no_contradiction(tmp_path):
     file = tmp_path / "log.csv"
-    np.savetxt(file, np.column_stack([T, np.sin(T), np.cos(T), 0.5 - np.sin(T), T]), delimiter=",")
+    file.write_text(text_of(np.column_stack([T, np.sin(T), np.cos(T), 0.5 - np.sin(T), T])))
     log = load_log(file, columns={"time": 0, "position": 1, "velocity": 2, "acceleration": 3, "effort": 4})
     assert np.abs(log.data[:, 2] - 0.5 + log.data[:, 0]).max() < 0.01

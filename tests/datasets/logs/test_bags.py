@@ -19,7 +19,7 @@ STORE = get_typestore(Stores.LATEST)
 TYPES = STORE.types
 STATES, TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
 START = 1_700_000_000_123_456_789  # ns since 1970
-T = irregular_times(4.0)
+T = irregular_times(2.5)
 NS = np.round(T * 1e9).astype(np.int64)
 
 

@@ -8,6 +8,8 @@ from numpy.testing import assert_allclose
 
 from skevgp.datasets import load_log, log_transitions
 
+from .cases import text_of
+
 T = np.arange(0.0, 20.0, 0.01)
 Q = 2.5 * T + np.sin(1.3 * T)
 DQ = 2.5 + 1.3 * np.cos(1.3 * T)
@@ -18,7 +20,7 @@ COLUMNS = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
 def load(tmp_path):
     def load(q, dq=None, t=T, **arguments):
         file = tmp_path / "log.csv"
-        np.savetxt(file, np.column_stack([t, q, q if dq is None else dq, np.cos(t)]), delimiter=",", fmt="%.17g")
+        file.write_text(text_of(np.column_stack([t, q, q if dq is None else dq, np.cos(t)])))
         ignored = {"velocity": "derive"} if dq is None else {}
         return load_log(file, **{"columns": COLUMNS, "rest_velocity": 0.0, **ignored, **arguments})
 

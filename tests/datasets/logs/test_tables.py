@@ -8,7 +8,7 @@ from skevgp.datasets import load_log
 
 from .cases import BY_NAME, BY_NUMBER, HEADER, irregular_times, table_of, write_table
 
-TABLE = table_of(irregular_times(3.0))
+TABLE = table_of(irregular_times(1.5))
 
 
 @pytest.fixture
@@ -16,9 +16,9 @@ def file(tmp_path):
     return write_table(tmp_path / "log.csv", TABLE)
 
 
-@pytest.fixture
-def expected(file):
-    return load_log(file, columns=BY_NUMBER)
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    return load_log(write_table(tmp_path_factory.mktemp("expected") / "log.csv", TABLE), columns=BY_NUMBER)
 
 
 def assert_equal(log, expected):
