@@ -11,8 +11,8 @@ L4acados needs acados, which has no wheel. Two classes stand in for it:
 """
 
 import pickle
-from copy import deepcopy
 from abc import ABC, abstractmethod
+from copy import deepcopy
 
 import numpy as np
 import pytest
