@@ -26,6 +26,8 @@ MAPS = {
     "dynamics": partial(NominalDynamics, terms=TERMS, model_error=0.2, unknown_ratio=5.0, other_ratio=0.02),
 }
 each_map = pytest.mark.parametrize("kind", MAPS)
+# A step that is not the default one, 0.03.
+each_step = pytest.mark.parametrize("dt", [0.2, *(pytest.param(dt, marks=pytest.mark.long) for dt in (0.002, 0.03))])
 ANY = {**MAPS, "angles": lambda robot, dt: AngleEncoder(robot, dt=dt)}
 any_map = pytest.mark.parametrize("kind", ANY)
 
@@ -114,7 +116,7 @@ def test_central_differences_agree_by_all_columns(robot, kind):
 
 @each_map
 @pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot", "iiwa14"])
-@pytest.mark.parametrize("dt", [0.002, 0.03, 0.2])
+@each_step
 def test_at_a_constant_step_the_prior_mean_is_that_of_the_number(robot, kind, dt):
     X, n_states = rows(robot), 2 * layout_of(robot).n_joints
     X[:, -1] = dt
@@ -136,7 +138,7 @@ def covariances(features, H, left_over):
 
 @each_map
 @pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot", "iiwa14"])
-@pytest.mark.parametrize("dt", [0.002, 0.03, 0.2])
+@each_step
 def test_at_a_constant_step_the_prior_covariance_is_that_of_the_number(robot, kind, dt):
     X, n = rows(robot), layout_of(robot).n_joints
     X[:, -1] = dt
