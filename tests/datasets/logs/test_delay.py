@@ -22,8 +22,18 @@ def late_table(t, delay):
     return table
 
 
-@pytest.mark.parametrize("delay", [0.02, -0.013, [0.03, -0.02]], ids=str)
-@pytest.mark.parametrize("irregular", [True, False])
+@pytest.mark.parametrize(
+    ("delay", "irregular"),
+    [
+        (0.02, True),
+        (-0.013, True),
+        ([0.03, -0.02], True),
+        ([0.03, -0.02], False),
+        pytest.param(0.02, False, marks=pytest.mark.long),
+        pytest.param(-0.013, False, marks=pytest.mark.long),
+    ],
+    ids=str,
+)
 def test_efforts_are_moved_to_the_motion_that_they_belong_to(tmp_path, delay, irregular):
     t = T if irregular else np.arange(0.0, 14.0, 0.008)
     file = write_table(tmp_path / "log.csv", late_table(t, delay))

@@ -40,9 +40,16 @@ def test_columns_by_name_are_columns_by_number(file, expected, columns):
     assert_equal(load_log(file, columns=columns), expected)
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
-@pytest.mark.parametrize("header", [HEADER, None], ids=["header", "no header"])
-@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.TXT"])
+def any_tables():
+    """Other names of files with two delimiters. With the rest of them they are for the long tests."""
+    for name in ("log.csv", "log.csv.gz", "log.TXT"):
+        for delimiter in (",", ";", "\t", " "):
+            for header in (HEADER, None):
+                quick = name == "log.csv" or (delimiter, header) in ((",", HEADER), (" ", None))
+                yield pytest.param(name, delimiter, header, marks=[] if quick else pytest.mark.long)
+
+
+@pytest.mark.parametrize(("name", "delimiter", "header"), list(any_tables()))
 def test_any_table_is_read(tmp_path, expected, delimiter, header, name):
     file = write_table(tmp_path / name, TABLE, header, delimiter)
     assert_equal(load_log(file, columns=BY_NUMBER), expected)
