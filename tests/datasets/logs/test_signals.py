@@ -52,7 +52,9 @@ def waves(t, frequency):
     return table
 
 
-@pytest.mark.parametrize("frequency", [1.0, 5.0, 12.0])
+@pytest.mark.parametrize(
+    "frequency", [1.0, 5.0, 12.0, *(pytest.param(other, marks=pytest.mark.long) for other in (3.0, 8.0))]
+)
 def test_filter_delays_nothing_and_is_butterworths_squared(load, frequency):
     t = np.arange(0.0, 10.0, 0.002)
     log = load(waves(t, frequency), dt=0.01, cutoff=5.0)
