@@ -47,7 +47,10 @@ def called(library, name, x, n_outputs, which="jacobian", without=()):
     return results
 
 
-@pytest.mark.parametrize("name", ["no maps", "cartpole", "groups", "rows of both", "sums", "exact, features"])
+OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in ("no maps", "groups", "sums", "exact, features")]
+
+
+@pytest.mark.parametrize("name", ["cartpole", "rows of both", *OTHERS])
 def test_c_predicts(name, tmp_path):
     model = fitted(MODELS[name], n_rows=30)
     source, header = model.to_c(tmp_path)
@@ -67,6 +70,7 @@ def test_c_predicts(name, tmp_path):
                 np.testing.assert_allclose(values, found[result], rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.long
 def test_c_predicts_rows_that_end_with_their_time_step(tmp_path):
     X, y = data()
     X = np.column_stack([X, np.linspace(0.005, 0.05, len(X))])
@@ -85,7 +89,7 @@ def test_c_predicts_rows_that_end_with_their_time_step(tmp_path):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """A model, and its library."""
-    model = fitted(sparse(POLYNOMIAL, sharing="all"))
+    model = fitted(sparse(POLYNOMIAL, sharing="all", n_inducing=4))
     return model, compiled(model.to_c(tmp_path_factory.mktemp("c"), "arm", include_noise=False)[0], "-O1")
 
 

@@ -12,6 +12,7 @@ L4acados needs acados, which has no wheel. Two classes stand in for it:
 
 import pickle
 from abc import ABC, abstractmethod
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -142,6 +143,7 @@ def test_invalid_columns_raise(model, columns):
 
 def test_update_after_partial_fit(model, rows):
     X, plan = rows
+    model = deepcopy(model)
     residual = model.to_l4acados()
     model.partial_fit(X[:20], following(X[:20]) + 0.1)
     assert np.abs(residual.evaluate(plan) - model.predict(plan)).max() > 1e-3

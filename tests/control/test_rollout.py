@@ -22,7 +22,7 @@ from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
 N_STEPS = 12
-QUICK = {"max_iter": 20, "solver": LBFGS(tol=1e6), "sharing": "all", "random_state": 0}
+QUICK = {"max_iter": 5, "solver": LBFGS(tol=1e6), "sharing": "all", "noise_cv": None, "random_state": 0}
 
 
 def plant(z, u):
@@ -51,7 +51,7 @@ PULL = ParametricFeatures(pull, {"rate": LogNormal(0.8, 1.0)})
 REGRESSORS = {
     "sparse": EVGPRegressor(n_inducing=15, **QUICK),
     "features": EVGPRegressor(FunctionTransformer(), kernel_map=StandardScaler(), n_inducing=15, **QUICK),
-    "exact": EGPRegressor(FunctionTransformer(), random_state=0, max_iter=20, tol=1e6),
+    "exact": EGPRegressor(FunctionTransformer(), random_state=0, max_iter=5, tol=1e6),
     "parameters": EVGPRegressor(PULL, n_inducing=15, **QUICK),
     "residual of parameters": ResidualRegressor(EVGPRegressor(PULL, n_inducing=15, **QUICK)),
     "residual": ResidualRegressor(EVGPRegressor(n_inducing=15, **QUICK)),
@@ -105,7 +105,7 @@ def test_mean_is_fed_back(model, inputs):
 
 @pytest.mark.parametrize("n_samples", [2, 5])
 def test_covariance_of_few_particles_is_unbiased(sparse, inputs, n_samples):
-    n_runs = 4000
+    n_runs = 2000
     found = rollout(sparse, np.tile(Z0, (n_runs, 1)), inputs[:1], n_samples=n_samples, random_state=0)
     _, std = sparse.predict(np.hstack([Z0, inputs[0]])[np.newaxis], return_std=True)
     # The variance of a normal distribution's sample variance is 2 / (n_samples - 1) times the square of its mean.
@@ -217,7 +217,7 @@ def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_o
     named, numbered = made(["speed", "torque"], ["angle"], sine).fit(frame, y), made([1, 2], [0], np.sin).fit(X, y)
     for method in ("mean", "linearized", "sample"):
         found, expected = (
-            rollout(each, Z0, inputs, method=method, n_samples=3, random_state=0) for each in (named, numbered)
+            rollout(each, Z0, inputs[:4], method=method, n_samples=3, random_state=0) for each in (named, numbered)
         )
         np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(found.std, expected.std, rtol=1e-6, atol=1e-8)

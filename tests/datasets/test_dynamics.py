@@ -17,7 +17,7 @@ def test_same_random_state_gives_same_bits():
 
 
 def test_noise_is_a_fraction_of_each_targets_scatter():
-    clean, noisy = (make_dynamics("cartpole", 20, 50, noise=noise, random_state=0) for noise in (0.0, 0.1))
+    clean, noisy = (make_dynamics("cartpole", 10, 40, noise=noise, random_state=0) for noise in (0.0, 0.1))
     fraction = (noisy.target - clean.target).std(axis=0) / clean.target.std(axis=0)
     assert fraction == pytest.approx(0.1, rel=0.15)
     assert_array_equal(noisy.data, clean.data)
@@ -68,12 +68,12 @@ def test_iiwa14_has_the_size_of_the_paper():
 
 @pytest.mark.parametrize("robot", ["iiwa14", load_robot("iiwa14")], ids=["name", "model"])
 def test_iiwa14_starts_at_rest_and_tracks_its_target(robot):
-    dynamics = make_dynamics(robot, 20, random_state=3)
+    dynamics = make_dynamics(robot, 5, random_state=3)
     rng = check_random_state(3)
-    q0 = 1.5 * rng.uniform(-1.0, 1.0, (20, 7))
-    q1 = q0 + 0.8 * rng.uniform(-1.0, 1.0, (20, 7))
+    q0 = 1.5 * rng.uniform(-1.0, 1.0, (5, 7))
+    q1 = q0 + 0.8 * rng.uniform(-1.0, 1.0, (5, 7))
     first = dynamics.trajectories[:, 0]
-    assert_array_equal(first, np.hstack([q0, np.zeros((20, 7))]))
+    assert_array_equal(first, np.hstack([q0, np.zeros((5, 7))]))
     desired = quintic_reference(q0, q1, 1.5, 0.03 * np.arange(51))[0]
     assert np.abs(dynamics.trajectories[..., :7] - desired).max() < 0.15
     assert np.abs(dynamics.trajectories[:, -1, :7] - q1).max() < 0.05

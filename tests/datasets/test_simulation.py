@@ -112,7 +112,7 @@ def test_without_damping_and_inputs_energy_is_kept(name, z0):
     model = load_robot(name)
     model.damping = np.zeros(model.nv)
     data, n = model.createData(), model.nv
-    Z = simulate(model, z0, np.zeros((100, layout_of(model).n_inputs)))
+    Z = simulate(model, z0, np.zeros((50, layout_of(model).n_inputs)))
     rotors = 0.5 * Z[:, n:] ** 2 @ model.armature  # Pinocchio's energy leaves them out
     links = [pinocchio.computeKineticEnergy(model, data, z[:n], z[n:]) for z in Z]
     potential = np.array([pinocchio.computePotentialEnergy(model, data, z[:n]) for z in Z])

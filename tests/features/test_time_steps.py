@@ -1,6 +1,6 @@
 """Rows that end with their own time step: dt="column"."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pandas as pd
@@ -26,6 +26,8 @@ MAPS = {
     "dynamics": partial(NominalDynamics, terms=TERMS, model_error=0.2, unknown_ratio=5.0, other_ratio=0.02),
 }
 each_map = pytest.mark.parametrize("kind", MAPS)
+# A step that is not the default one, 0.03.
+each_step = pytest.mark.parametrize("dt", [0.2, *(pytest.param(dt, marks=pytest.mark.long) for dt in (0.002, 0.03))])
 ANY = {**MAPS, "angles": lambda robot, dt: AngleEncoder(robot, dt=dt)}
 any_map = pytest.mark.parametrize("kind", ANY)
 
@@ -114,7 +116,7 @@ def test_central_differences_agree_by_all_columns(robot, kind):
 
 @each_map
 @pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot", "iiwa14"])
-@pytest.mark.parametrize("dt", [0.002, 0.03, 0.2])
+@each_step
 def test_at_a_constant_step_the_prior_mean_is_that_of_the_number(robot, kind, dt):
     X, n_states = rows(robot), 2 * layout_of(robot).n_joints
     X[:, -1] = dt
@@ -136,7 +138,7 @@ def covariances(features, H, left_over):
 
 @each_map
 @pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot", "iiwa14"])
-@pytest.mark.parametrize("dt", [0.002, 0.03, 0.2])
+@each_step
 def test_at_a_constant_step_the_prior_covariance_is_that_of_the_number(robot, kind, dt):
     X, n = rows(robot), layout_of(robot).n_joints
     X[:, -1] = dt
@@ -260,20 +262,30 @@ def log(n_trajectories, n_steps, seed, shortest=0.005, longest=0.05):
     return np.vstack(X), np.vstack(y), np.tile(np.arange(n_trajectories), n_steps)
 
 
-def model(features):
+QUICK = {"n_inducing": 10, "sharing": "none", "noise_cv": None, "max_iter": 30}
+
+
+def model(features, **settings):
     """With or without features the kernel sees Δt."""
     encoder = AngleEncoder("pendulum", dt="column")
-    return EVGPRegressor(features, kernel_map=encoder, n_inducing=20, sharing="all", max_iter=60, random_state=0)
+    return EVGPRegressor(features, kernel_map=encoder, random_state=0, **settings)
 
 
-def with_physics():
-    return model(InertiaForceGravity("pendulum", dt="column"))
+def with_physics(**settings):
+    return model(InertiaForceGravity("pendulum", dt="column"), **settings)
 
 
-def errors(X, y, groups, X_new, y_new):
+@cache
+def of_log():
+    """A log and a model of it, fitted once."""
+    X, y, groups = log(8, 25, seed=0)
+    return X, y, groups, with_physics(**QUICK).fit(X, y, groups=groups)
+
+
+def errors(physics, X, y, groups, X_new, y_new, **settings):
     """Root mean square errors (2,) with physics, and of a Gaussian process of what changes in a step."""
-    physics = with_physics().fit(X, y, groups=groups).predict(X_new)
-    plain = model(None).fit(X, y - X[:, :2], groups=groups).predict(X_new) + X_new[:, :2]
+    physics = physics.predict(X_new)
+    plain = model(None, **settings).fit(X, y - X[:, :2], groups=groups).predict(X_new) + X_new[:, :2]
     return (np.sqrt(np.mean((mean - y_new) ** 2, axis=0)) for mean in (physics, plain))
 
 
@@ -287,7 +299,8 @@ class TestLogs:
     pytestmark = of_short_fits
 
     def test_physics_learns_from_uneven_steps_what_a_column_alone_does_not_tell(self):
-        physics, plain = errors(*log(8, 25, seed=0), *log(20, 50, seed=1)[:2])
+        X, y, groups, fitted = of_log()
+        physics, plain = errors(fitted, X, y, groups, *log(20, 20, seed=1)[:2], **QUICK)
         assert physics[0] < 1.2 * plain[0]
         assert physics[1] < 0.6 * plain[1]
 
@@ -296,15 +309,19 @@ class TestLogs:
         """Geometric mean of three logs: what a kernel alone says of longer steps is chance, and may be good."""
         ratios = []
         for seed in (0, 10, 20):
-            physics, plain = errors(*log(8, 25, seed, longest=0.02), *log(20, 50, seed + 1, shortest=0.04)[:2])
+            X, y, groups = log(8, 25, seed, longest=0.02)
+            settings = {"n_inducing": 20, "max_iter": 60}
+            fitted = with_physics(**settings).fit(X, y, groups=groups)
+            new = log(20, 50, seed + 1, shortest=0.04)[:2]
+            physics, plain = errors(fitted, X, y, groups, *new, **settings)
             ratios.append(physics / plain)
         assert (np.exp(np.mean(np.log(ratios), axis=0)) < 0.7).all()
 
     def test_weights_are_physics_within_their_std_and_what_eulers_rule_neglects(self):
         """What it neglects is ½ Δt times the rate of the rates: 19.62 of the angle's, 4 of the torque's."""
-        X, y, groups = log(8, 25, seed=0)
+        X, y, groups, _ = of_log()
         y = y + [0.002, 0.02] * np.random.default_rng(0).standard_normal(y.shape)
-        fitted = with_physics().fit(X, y, groups=groups)
+        fitted = with_physics(**QUICK).fit(X, y, groups=groups)
         assert_array_equal(fitted.coef_[:, :2], np.eye(2))
         weights, std = fitted.coef_[:, 2:], fitted.coef_std_[:, 2:]
         neglected = 0.05 * np.array([[19.62, 0.4, 4.0, 19.62], [8.0, 19.62, 1.6, 8.0]])
@@ -314,8 +331,7 @@ class TestLogs:
         assert std[1, 3] < 5.0
 
     def test_a_controller_gives_its_steps_too_and_rollouts_follow_the_pendulum(self):
-        X, y, groups = log(8, 25, seed=0)
-        fitted = with_physics().fit(X, y, groups=groups)
+        *_, fitted = of_log()
         path, states, _ = log(1, 30, seed=2)
         U = path[:, 2:]
         for method in ("sample", "linearized", "mean"):
@@ -332,7 +348,7 @@ class TestLogs:
     def test_what_is_compiled_predicts_and_is_differentiated_by_the_step_too(self):
         X, y, groups = log(6, 15, seed=0)
         union = make_union(InertiaForceGravity("pendulum", dt="column"), NominalDynamics("pendulum", dt="column"))
-        fitted = model(union).fit(X, y, groups=groups)
+        fitted = model(union, **QUICK).fit(X, y, groups=groups)
         rows, h = X[:5], 1e-6
         mean, slopes = fitted.compile().value_and_jacobian(rows)
         assert_allclose(mean, fitted.predict(rows), rtol=1e-10)

@@ -22,7 +22,7 @@ def motion(t):
     return q, dq, ddq, 2.0 + 0.5 * ddq + 0.1 * dq
 
 
-def irregular_times(duration=20.0, seed=0):
+def irregular_times(duration=14.0, seed=0):
     """Rows about every 8 ms, a jitter of 4 ms."""
     steps = np.arange(0.0, duration, 0.008)
     return steps + np.random.RandomState(seed).uniform(0.0, 0.004, len(steps))
@@ -33,10 +33,15 @@ def table_of(t):
     return np.column_stack([t, q, np.zeros(len(q)), dq, current])
 
 
+def text_of(table, number="%.17g", delimiter=","):
+    """Its rows as lines. Formatting all at once is much faster than np.savetxt."""
+    row = delimiter.join([number] * table.shape[1]) + "\n"
+    return row * len(table) % tuple(table.ravel().tolist())
+
+
 def write_table(path, table, header=HEADER, delimiter=","):
-    lines = [] if header is None else [delimiter.join(header)]
-    lines += [delimiter.join(f"{value:.12g}" for value in row) for row in table]
-    text = "\n".join(lines) + "\n"
+    text = "" if header is None else delimiter.join(header) + "\n"
+    text += text_of(table, "%.12g", delimiter)
     with gzip.open(path, "wt") if path.suffix == ".gz" else path.open("w") as file:
         file.write(text)
     return path

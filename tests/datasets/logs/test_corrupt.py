@@ -86,11 +86,11 @@ def genuine(name):
         table[:, EFFORT] += rng.standard_t(4, len(t))
         table[:, VELOCITY] += 0.2 * rng.standard_t(4, len(t))
     elif name == "differences of coarse positions":
-        table = pendulum(0.002)
+        table = pendulum(0.002, 10.0)
         table[:, 1] = np.round(table[:, 1], 3)
         table[1:, VELOCITY] = np.diff(table[:, 1]) / 0.002
     elif name == "impacts":
-        table = pendulum(0.002)
+        table = pendulum(0.002, 10.0)
         t = table[:, 0]
         table[:, 1], table[:, VELOCITY] = np.abs(np.sin(t)), np.cos(t) * np.sign(np.sin(t))
         table[:, EFFORT] = np.sin(t) + 3.0 * (np.abs(np.sin(t)) < 0.001)

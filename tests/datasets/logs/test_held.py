@@ -16,7 +16,15 @@ def held(starts, n_rows):
     return table
 
 
-@pytest.mark.parametrize(("n_rows", "derive"), [(7, False), (20, False), (40, False), (20, True), (40, True)])
+@pytest.mark.parametrize(
+    ("n_rows", "derive"),
+    [
+        (7, False),
+        (40, False),
+        (20, True),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in ((20, False), (40, True))),
+    ],
+)
 def test_frames_that_are_held_are_cut(load, n_rows, derive):
     starts = np.arange(150, 1900, 233)
     with pytest.warns(RobotModelWarning, match=f"{len(starts) * (n_rows - 1)} rows repeat the frame before them"):
@@ -40,7 +48,7 @@ def test_frame_that_is_held_to_the_end_is_cut(load):
 
 @pytest.mark.parametrize("times", [2, 4, 5])
 def test_sensor_that_is_slower_than_the_log_is_no_fault(load, times):
-    table = pendulum(0.002)
+    table = pendulum(0.002, 10.0)
     slow = table[::times].repeat(times, axis=0)[: len(table)]
     slow[:, 0] = table[:, 0]
     log = load(slow)

@@ -52,9 +52,11 @@ def waves(t, frequency):
     return table
 
 
-@pytest.mark.parametrize("frequency", [1.0, 5.0, 12.0])
+@pytest.mark.parametrize(
+    "frequency", [1.0, 5.0, 12.0, *(pytest.param(other, marks=pytest.mark.long) for other in (3.0, 8.0))]
+)
 def test_filter_delays_nothing_and_is_butterworths_squared(load, frequency):
-    t = np.arange(0.0, 20.0, 0.002)
+    t = np.arange(0.0, 10.0, 0.002)
     log = load(waves(t, frequency), dt=0.01, cutoff=5.0)
     phase = 2.0 * np.pi * frequency * log.time[:, np.newaxis]
     weights = np.linalg.lstsq(np.hstack([np.sin(phase), np.cos(phase)]), log.target[:, 0], rcond=None)[0]
@@ -153,7 +155,7 @@ def spoilt(row, column, value):
         (table_of([0.0, 0.01]), {"cutoff": None}, "too short: .* longer than the 0.02 s cut at its ends"),
         (table_of(np.zeros(9)), {}, "its 9 rows do not have two different times"),
         (table_of(irregular_times()), {"rest_velocity": 99.0}, "all rows are at rest: .* than rest_velocity=99"),
-        (table_of(np.r_[irregular_times(), irregular_times()]), {}, r"its clock goes back by 19.9\d* s at 0 s"),
+        (table_of(np.r_[irregular_times(), irregular_times()]), {}, r"its clock goes back by 13.9\d* s at 0 s"),
         (table_of(np.arange(0.0, 9.0, 0.01)), {"cutoff": 50.0}, r"cutoff=50 Hz must be below 50 Hz.*row every 0.01 s"),
         (table_of(np.arange(0.0, 9.0, 0.01)), {"cutoff": 5.0, "dt": 0.1}, "cutoff=5 Hz must be below 5 Hz"),
         (table_of(np.arange(0.0, 9.0, 0.2)), {"dt": 0.05}, r"must be below 2.5 Hz.*a row every 0.2 s"),

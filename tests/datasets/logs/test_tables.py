@@ -8,7 +8,7 @@ from skevgp.datasets import load_log
 
 from .cases import BY_NAME, BY_NUMBER, HEADER, irregular_times, table_of, write_table
 
-TABLE = table_of(irregular_times(3.0))
+TABLE = table_of(irregular_times(1.5))
 
 
 @pytest.fixture
@@ -16,9 +16,9 @@ def file(tmp_path):
     return write_table(tmp_path / "log.csv", TABLE)
 
 
-@pytest.fixture
-def expected(file):
-    return load_log(file, columns=BY_NUMBER)
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    return load_log(write_table(tmp_path_factory.mktemp("expected") / "log.csv", TABLE), columns=BY_NUMBER)
 
 
 def assert_equal(log, expected):
@@ -40,9 +40,16 @@ def test_columns_by_name_are_columns_by_number(file, expected, columns):
     assert_equal(load_log(file, columns=columns), expected)
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
-@pytest.mark.parametrize("header", [HEADER, None], ids=["header", "no header"])
-@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.TXT"])
+def any_tables():
+    """Other names of files with two delimiters. With the rest of them they are for the long tests."""
+    for name in ("log.csv", "log.csv.gz", "log.TXT"):
+        for delimiter in (",", ";", "\t", " "):
+            for header in (HEADER, None):
+                quick = name == "log.csv" or (delimiter, header) in ((",", HEADER), (" ", None))
+                yield pytest.param(name, delimiter, header, marks=[] if quick else pytest.mark.long)
+
+
+@pytest.mark.parametrize(("name", "delimiter", "header"), list(any_tables()))
 def test_any_table_is_read(tmp_path, expected, delimiter, header, name):
     file = write_table(tmp_path / name, TABLE, header, delimiter)
     assert_equal(load_log(file, columns=BY_NUMBER), expected)
