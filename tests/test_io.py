@@ -63,7 +63,7 @@ def test_predictions_are_the_same_to_the_bit(name, path):
     assert_same(predictions(loaded, rows), predictions(model, rows))
     assert type(loaded) is type(model)
     assert sorted(set(vars(loaded)) ^ set(vars(model))) == []
-    assert content_of(path)["trial"] is not None
+    assert compares_predictions(path)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_search_and_meta_estimators_are_saved(name, path):
     groups = {"groups": np.arange(60) // 10} if name == "search by name" else {}
     model = clone(_OF_SCIKIT_LEARN[name]).fit(X, Y[:, :2], **groups)
     assert_same([again(model, path).predict(X_NEW)], [model.predict(X_NEW)])
-    assert content_of(path)["trial"] is not None
+    assert compares_predictions(path)
 
 
 # --- robots ------------------------------------------------------------------------------------------------------
@@ -221,6 +221,11 @@ def write_members(path, members, compression=zipfile.ZIP_STORED):
             archive.writestr(name, content)
 
 
+def compares_predictions(path):
+    """Whether the file holds rows with their predictions, without the time that loading it takes."""
+    return json.loads(members_of(path)["schema.json"])["content"]["trial"]["__class__"] == "dict"
+
+
 def content_of(path):
     return skops.io.load(path, trusted=TRUSTED_TYPES)
 
@@ -234,8 +239,8 @@ def write_content(path, content, **about):
 
 def test_foreign_files_raise(path):
     save(fitted("plain"), path)
-    write_members(path, {**members_of(path), "more": bytes(2**27)}, zipfile.ZIP_DEFLATED)
-    with pytest.raises(ValueError, match=r"model.skevgp' .* bytes and unpacks to 134"):
+    write_members(path, {**members_of(path), "more": bytes(2**25)}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match=r"model.skevgp' .* bytes and unpacks to 33"):
         load(path)
     write_members(path, {"model.json": "{}"})
     with pytest.raises(ValueError, match=r"model.skevgp' .*of skevgp 0\.1, which this version does not read"):
