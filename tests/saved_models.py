@@ -82,7 +82,7 @@ def encoded(*words):
 
 
 def evgp(*maps, **options):
-    """A model whose fit is short: choosing what outputs share and calibrating take most of the time of so small a fit."""
+    """A model whose fit is short: choosing what outputs share and calibrating would take most of the time."""
     options = {"n_inducing": 6, "max_iter": 3, "sharing": "all", "noise_cv": None, "random_state": 0, **options}
     return EVGPRegressor(*maps, **options)
 
