@@ -94,10 +94,11 @@ def test_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
 
 # --- files --------------------------------------------------------------------------------------------------------
 
+SHORT = {"n_inducing": 8, "max_iter": 3, "noise_cv": None, "random_state": 0}
 SAVED = [
-    EVGPRegressor(TREND, kernel_map=StandardScaler(), n_inducing=8, max_iter=3, random_state=0),
-    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver=Adam(natural_gradient=True), random_state=0),
-    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver=LBFGS(posterior="diagonal"), sharing="none", random_state=0),
+    EVGPRegressor(TREND, kernel_map=StandardScaler(), **SHORT),
+    EVGPRegressor(TREND, solver=Adam(natural_gradient=True), **SHORT | {"sharing": "all"}),
+    EVGPRegressor(TREND, solver=LBFGS(posterior="diagonal"), **SHORT | {"sharing": "none"}),
     EGPRegressor(
         TREND,
         2.0 * RBF([0.5, 0.7], "fixed") + Matern(nu=1.5) + WhiteKernel(0.1),
@@ -105,7 +106,7 @@ SAVED = [
         max_iter=3,
     ),
     BayesianMLPRegressor((5,), max_iter=3, random_state=0),
-    ResidualRegressor(EVGPRegressor(n_inducing=8, max_iter=3, random_state=0)),
+    ResidualRegressor(EVGPRegressor(**SHORT | {"sharing": "all"})),
 ]
 
 

@@ -49,7 +49,7 @@ THREADED = {
 OTHERS = {
     "exact": EGPRegressor(PolynomialFeatures(1), Matern(nu=1.5), n_restarts=1, max_iter=3, random_state=0),
     "network": BayesianMLPRegressor((5,), max_iter=2, early_stopping=True, random_state=0),
-    "residual": ResidualRegressor(evgp()),
+    "residual": ResidualRegressor(evgp(sharing="all")),
 }
 ATTRIBUTES = ("coef_", "coef_cov_", "noise_variance_", "weights_", "loss_curve_", "lower_bound_", "upper_bound_")
 

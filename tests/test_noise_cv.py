@@ -19,9 +19,6 @@ from skevgp.solvers import LBFGS, SOLVERS
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
 
-SETTINGS = [("lbfgs", "full"), ("lbfgs", "diagonal"), ("adam", "full"), ("adam", "diagonal")]
-
-
 def trajectories(n, seed, length=100):
     """Slow walks through a square, one after the other, over a function too rough for few inducing points."""
     rng = np.random.RandomState(seed)
@@ -36,7 +33,9 @@ X_NEW, Y_NEW, _ = trajectories(40, 1)
 
 
 def model(**arguments):
-    defaults = {"feature_map": PolynomialFeatures(1), "n_inducing": 12, "max_iter": 30, "random_state": 0}
+    # What outputs share is another subject, and trial fits of it would take most of the time.
+    defaults = {"feature_map": PolynomialFeatures(1), "n_inducing": 12, "sharing": "all", "max_iter": 30}
+    defaults |= {"random_state": 0}
     return EVGPRegressor(**{**defaults, **arguments})
 
 
@@ -71,16 +70,28 @@ def test_on_new_trajectories_as_many_rows_as_should_lie_within_the_std():
 
 def test_what_few_points_cannot_represent_is_not_taken_for_noise():
     rng = np.random.RandomState(0)
-    X = rng.uniform(-3, 3, (3000, 2))
-    y = np.sin(4 * X[:, 0]) * np.cos(3 * X[:, 1]) + 0.05 * rng.randn(3000)
-    train, test = slice(0, 2000), slice(2000, None)
+    X = rng.uniform(-3, 3, (1600, 2))
+    y = np.sin(4 * X[:, 0]) * np.cos(3 * X[:, 1]) + 0.05 * rng.randn(1600)
+    train, test = slice(0, 800), slice(800, None)
     plain, calibrated = (model(n_inducing=60, noise_cv=cv).fit(X[train], y[train]) for cv in (None, 5))
     assert calibrated.noise_variance_ < 0.9 * plain.noise_variance_
     assert nlpd(calibrated, X[test], y[test]) < nlpd(plain, X[test], y[test])
 
 
-@pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
-@pytest.mark.parametrize(("sharing", "feature_map"), [("all", None), ("none", PolynomialFeatures(1))])
+# Each pair of sharing, solver and posterior is quick. Their other products are long.
+@pytest.mark.parametrize(
+    ("sharing", "feature_map", "solver", "posterior"),
+    [
+        ("all", None, "lbfgs", "full"),
+        ("all", None, "adam", "diagonal"),
+        ("none", PolynomialFeatures(1), "lbfgs", "diagonal"),
+        ("none", PolynomialFeatures(1), "adam", "full"),
+        pytest.param("all", None, "lbfgs", "diagonal", marks=pytest.mark.long),
+        pytest.param("all", None, "adam", "full", marks=pytest.mark.long),
+        pytest.param("none", PolynomialFeatures(1), "lbfgs", "full", marks=pytest.mark.long),
+        pytest.param("none", PolynomialFeatures(1), "adam", "diagonal", marks=pytest.mark.long),
+    ],
+)
 def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
     settings = {"feature_map": feature_map, "sharing": sharing, "solver": SOLVERS[solver](posterior=posterior)}
     # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
@@ -120,6 +131,7 @@ def test_calibration_of_independent_outputs():
     X, X_new = rng.uniform(-2, 2, (60, 3)), rng.uniform(-2, 2, (300, 3))
     Y, Y_new = targets(X), targets(X_new)
     arguments = {"feature_map": PolynomialFeatures(4), "coef_prior": CoefPrior(shared=True), "max_iter": 200}
+    arguments["sharing"] = "auto"
     plain, calibrated = (model(noise_cv=noise_cv, **arguments).fit(X, Y) for noise_cv in (None, 5))
     assert nlpd(calibrated, X_new, Y_new) < nlpd(plain, X_new, Y_new) + 1.0
 
@@ -151,17 +163,17 @@ def test_without_iterations_or_with_few_rows_it_is_left_out(n_rows):
 
 def test_points_at_all_rows_leave_nothing_to_folds_but_to_groups():
     X, Y = independent(60)
-    plain, m = (model(n_inducing=60, noise_cv=cv).fit(X, Y) for cv in (None, 5))
+    plain, m = (model(n_inducing=60, max_iter=5, noise_cv=cv).fit(X, Y) for cv in (None, 5))
     np.testing.assert_array_equal(m.noise_variance_, plain.noise_variance_)
-    grouped = model(n_inducing=60).fit(X, Y, groups=np.arange(60) // 6)
+    grouped = model(n_inducing=60, max_iter=5).fit(X, Y, groups=np.arange(60) // 6)
     assert (grouped.noise_variance_ != plain.noise_variance_).all()
     assert np.isfinite(grouped.predict(X_NEW, return_std=True)).all()
 
 
-@pytest.mark.parametrize("groups", [[None if g == 0 else f"{g}" for g in GROUPS]])
-def test_labels_may_be_anything(groups):
-    m = fitted(groups, noise_cv=20)
-    expected = fitted(noise_cv=20)
+def test_labels_may_be_anything():
+    some = {"X": X[:600], "Y": Y[:600], "noise_cv": 6, "max_iter": 5}
+    m = fitted([None if g == 0 else f"{g}" for g in GROUPS[:600]], **some)
+    expected = fitted(GROUPS[:600], **some)
     # One group is one fold, whatever it is called; which of them comes first is a matter of rounding.
     np.testing.assert_allclose(m.noise_variance_, expected.noise_variance_, rtol=1e-6)
 
@@ -183,27 +195,29 @@ def test_invalid_number_of_folds_raises(noise_cv):
         fitted(noise_cv=noise_cv)
 
 
-@pytest.mark.parametrize(("sharing", "groups"), [("all", None), ("none", GROUPS)])
+@pytest.mark.parametrize(("sharing", "groups"), [("all", None), ("none", GROUPS[:600])])
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_same_bits_for_any_n_jobs(sharing, groups, monkeypatch):
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 64)
     monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
     monkeypatch.setattr("skevgp.data.blocks._BLOCK_NUMBERS", 64)
-    fits = [fitted(groups, sharing=sharing, n_jobs=n_jobs, max_iter=3, noise_cv=4) for n_jobs in (1, 3)]
+    options = {"X": X[:600], "Y": Y[:600], "sharing": sharing, "max_iter": 3, "noise_cv": 4}
+    fits = [fitted(groups, n_jobs=n_jobs, **options) for n_jobs in (1, 3)]
     np.testing.assert_array_equal(fits[0].noise_variance_, fits[1].noise_variance_)
     np.testing.assert_array_equal(fits[0].predict(X_NEW), fits[1].predict(X_NEW))
 
 
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_partial_fit_keeps_noise_and_signal():
-    m = model().partial_fit(X, Y)
-    noise, std = m.noise_variance_, m.predict(X_NEW, return_std=True, include_noise=False)[1]
-    np.testing.assert_array_equal(noise, fitted(None).noise_variance_)
+    rows_new, targets_new = X_NEW[:600], Y_NEW[:600]
+    m = model(max_iter=5).partial_fit(X[:600], Y[:600])
+    noise, std = m.noise_variance_, m.predict(rows_new, return_std=True, include_noise=False)[1]
+    np.testing.assert_array_equal(noise, fitted(None, X[:600], Y[:600], max_iter=5).noise_variance_)
     theta = [k.theta for k in m.kernel_]
-    m.partial_fit(X_NEW, Y_NEW)
+    m.partial_fit(rows_new, targets_new)
     np.testing.assert_array_equal(m.noise_variance_, noise)
     np.testing.assert_array_equal([k.theta for k in m.kernel_], theta)
-    assert (m.predict(X_NEW, return_std=True, include_noise=False)[1] < std).all()
+    assert (m.predict(rows_new, return_std=True, include_noise=False)[1] < std).all()
 
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
@@ -251,12 +265,12 @@ def test_group_of_most_rows_is_not_predicted_from_the_few_others():
 @pytest.mark.parametrize(
     "fit",
     [
-        lambda: fitted(),
+        lambda: fitted(sharing="auto"),
         lambda: fitted(None, *_sorted_by_y()),
         lambda: fitted(None, noise_cv=None),
         lambda: fitted(None, *(part[np.random.RandomState(0).permutation(len(X))] for part in (X, Y))),
-        lambda: fitted(None, *independent()),
-        lambda: fitted(None, *(part[np.argsort(independent()[0][:, 0])] for part in independent())),
+        lambda: fitted(None, *independent(1000)),
+        lambda: fitted(None, *(part[np.argsort(independent(1000)[0][:, 0])] for part in independent(1000))),
     ],
     ids=["groups", "sorted by y", "not calibrated", "shuffled", "independent", "sorted"],
 )
@@ -266,7 +280,7 @@ def test_unrelated_rows_do_not_warn(fit):
         fit()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 3))])
 def test_signal_falls_if_it_does_not_hold_for_other_groups(seed):
     """Groups overlap, and each has a phase of its own."""
     rng = np.random.RandomState(seed)

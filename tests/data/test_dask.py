@@ -68,7 +68,7 @@ def test_fit_to_chunks_is_fit_to_arrays(sharing, feature_map):
 
 def test_chunks_may_be_of_one_row_or_none():
     rows = (1, 299, 0, 1, 299)
-    parameters = {"max_iter": 5, "noise_cv": 5}
+    parameters = {"max_iter": 5, "noise_cv": 5, "sharing": "all"}
     assert_same_model(model(**parameters).fit(*chunked(X, Y, rows=rows)), model(**parameters).fit(X, Y))
 
 
@@ -97,7 +97,7 @@ def test_adam_takes_its_batches_from_the_chunks():
 
 @pytest.mark.parametrize("include_noise", [True, False])
 def test_prediction_is_lazy_and_chunk_by_chunk(include_noise):
-    fitted = model().fit(X, Y)
+    fitted = model(max_iter=0).fit(X, Y)
     (rows,) = chunked(X_NEW, rows=(20, 0, 30))
     mean, std = fitted.predict(rows, return_std=True, include_noise=include_noise)
     assert mean.chunks == std.chunks == ((20, 0, 30), (2,))
@@ -186,7 +186,7 @@ def test_invalid_chunks_raise(bad_X, bad_y, message):
 
 
 def test_options_without_dask_raise():
-    fitted = model().fit(X, Y)
+    fitted = model(max_iter=0).fit(X, Y)
     (rows,) = chunked(X_NEW, rows=(20, 30))
     with pytest.raises(ValueError, match="return_cov.*Dask"):
         fitted.predict(rows, return_cov=True)

@@ -89,23 +89,23 @@ def assert_as_refitted(model, values, rows, folds, joint=False, rtol=1e-8, **wei
                             np.testing.assert_allclose(own[:, min(i, own.shape[1] - 1)], oracle, rtol=rtol, atol=1e-9)
 
 
-@pytest.mark.parametrize(("features", "n_folds"), [(3, 2), (0, 3), (3, 60)])
+@pytest.mark.parametrize(("features", "n_folds"), [(3, 2), (0, 3), (3, 30)])
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("family", ["full", "diagonal"])
 def test_left_out_rows_are_predicted_as_by_refits_without_their_fold(family, shared, features, n_folds):
-    model, rows, table = problem(family, shared, p=features)
+    model, rows, table = problem(family, shared, n=30, p=features)
     folds = parts(len(rows), n_folds)
     assert_as_refitted(
         model,
         table.values(table.start()),
         rows,
-        folds if n_folds < 60 else folds[:2] + [np.sort(np.concatenate(folds[2:]))],
+        folds if n_folds < 30 else folds[:2] + [np.sort(np.concatenate(folds[2:]))],
     )
 
 
 @pytest.mark.parametrize("family", ["full", "diagonal"])
 def test_weights_of_rows_and_their_noise(family):
-    model, rows, table = problem(family)
+    model, rows, table = problem(family, n=30)
     rng = np.random.RandomState(1)
     counts, relative = rng.randint(1, 4, len(rows)).astype(float), rng.uniform(0.2, 3.0, len(rows))
     weights = {"counts": counts, "precision": counts / relative}
@@ -116,7 +116,7 @@ def test_weights_of_rows_and_their_noise(family):
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("family", ["full", "diagonal"])
 def test_correlated_weights_and_weights_that_outputs_share(family, shared, joint):
-    model, rows, table = problem(family, shared)
+    model, rows, table = problem(family, shared, n=30)
     root = np.tril(0.3 + np.random.RandomState(2).rand(3, 3))
     prior = model.prior
     roots = np.array([root, root if joint else 2.0 * root])

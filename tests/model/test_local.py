@@ -112,7 +112,7 @@ def test_errors_against_the_exact_model_fall_with_the_number_of_neighbours():
     assert np.max(errors[-1]) < 1e-8
 
 
-@pytest.mark.parametrize("k", [0, 5, N])
+@pytest.mark.parametrize("k", [0, 5, 25])
 @pytest.mark.parametrize("kernels", ["one", "own"])
 def test_gradient_agrees_with_finite_differences(k, kernels):
     """Neighbours are held. Outputs have one kernel, or each their own with other length scales."""
@@ -121,7 +121,7 @@ def test_gradient_agrees_with_finite_differences(k, kernels):
         model = replace(model, groups=(slice(0, 1), slice(1, 2)), kernels=(model.kernel, model.kernel))
         values = values | {"hyperparameters": np.array([[0.8, 1.3], [0.5, 2.0]])}
         values["inducing_points"] = np.repeat(VALUES["inducing_points"], 2, axis=0)
-    local = LocalModel.of(model, ROWS, k, ORDER)
+    local = LocalModel.of(model, ROWS[:25], k, np.argsort(ORDER[:25]))
     by_output = values_by_output(model, values)
     neighbours = local.neighbours(local.known(by_output))
     _, gradient = local.log_likelihood(by_output, neighbours)

@@ -102,7 +102,7 @@ def test_upper_bound_holds_after_forgetting():
 
 @pytest.mark.parametrize("name", [name for name in KERNELS if name != "ConstantKernel"])
 def test_gradient_agrees_with_finite_differences_for_all_kernels(name):
-    model, rows, table = model_with(KERNELS[name])
+    model, rows, table = model_with(KERNELS[name], n=25, m=3, p=1)
     raw = weighted(rows, *drawn(len(rows)))
     objective = BoundObjective(model, table, blocks_of(raw, model.kernel))
     _, gradient = objective(table.start())
