@@ -75,14 +75,7 @@ def interrupt(*told):
     raise KeyboardInterrupt
 
 
-# "auto" makes fits of the kinds of "all" and "kernel".
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("auto", "none", "student-t", "adam", "natural", *OTHERS),
-        *(pytest.param(name, marks=pytest.mark.long) for name in ("all", "kernel")),
-    ],
-)
+@pytest.mark.parametrize("name", ["auto", "all", "kernel", "none", "student-t", "adam", "natural", *OTHERS])
 def test_fits_and_predictions(name):
     model = clone((THREADED | OTHERS)[name])
     if name in THREADED:
@@ -111,7 +104,7 @@ def test_interrupted_fits(solver, n_jobs):
 
 
 def test_files(tmp_path):
-    for name in ("exact", "network", "residual"):
+    for name in ("all", "exact", "network", "residual"):
         save(clone((THREADED | OTHERS)[name]).fit(X, Y), tmp_path / "model")
         load(tmp_path / "model").predict(X_NEW)
     (tmp_path / "model").write_bytes(b"no model")

@@ -172,10 +172,13 @@ def test_forgetting_raises():
         at_once().fit(X, Y).partial_fit(X, Y, forgetting_factor=0.9)
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 # So few rows do not tell the rate, whose feature is almost a straight line.
-@pytest.mark.filterwarnings("ignore::skevgp.exceptions.UnidentifiedWarning")
-@pytest.mark.parametrize("case", ["offset", "smooth output", "shared weights", "parameters"])
+UNIDENTIFIED = pytest.mark.filterwarnings("ignore::skevgp.exceptions.UnidentifiedWarning")
+PARAMETERS = pytest.param("parameters", marks=UNIDENTIFIED)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("case", ["offset", "smooth output", "shared weights", PARAMETERS])
 def test_details_are_found_whatever_is_beside_them(case):
     """The sparse fit takes the details of the first output for noise. The start of the local fit must not.
 

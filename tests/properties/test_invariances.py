@@ -20,6 +20,7 @@ from .cases import (
     assert_same_predictions,
     columns_of,
     data,
+    fewer,
     fixed_cases,
     fixed_models,
     learned_cases,
@@ -48,6 +49,7 @@ def assert_same_value(one, other, shift=0.0):
 # --- rows: the same bits, so that iterations that follow are the same too -------------------------------------------
 
 
+@fewer(2)
 @given(learned_cases(), st.data())
 def test_order_of_rows_changes_no_bit(case, draws):
     order = draws.draw(st.permutations(range(len(case.X))))
@@ -58,6 +60,7 @@ def test_order_of_rows_changes_no_bit(case, draws):
         np.testing.assert_array_equal(other.weights_, one.weights_[order])
 
 
+@fewer(2)
 @given(learned_cases())
 def test_fit_repeats_to_the_bit(case):
     model = case.fitted()
@@ -73,6 +76,7 @@ def repetitions(draw, n_rows):
     return weights, np.repeat(np.arange(n_rows), weights)
 
 
+@fewer(2)
 @given(learned_cases(given_maps=STATELESS), st.data())
 def test_weight_is_so_many_rows_to_the_bit(case, draws):
     weights, rows = draws.draw(repetitions(len(case.X)))
