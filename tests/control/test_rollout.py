@@ -105,7 +105,7 @@ def test_mean_is_fed_back(model, inputs):
 
 @pytest.mark.parametrize("n_samples", [2, 5])
 def test_covariance_of_few_particles_is_unbiased(sparse, inputs, n_samples):
-    n_runs = 2000
+    n_runs = 4000
     found = rollout(sparse, np.tile(Z0, (n_runs, 1)), inputs[:1], n_samples=n_samples, random_state=0)
     _, std = sparse.predict(np.hstack([Z0, inputs[0]])[np.newaxis], return_std=True)
     # The variance of a normal distribution's sample variance is 2 / (n_samples - 1) times the square of its mean.
