@@ -350,7 +350,6 @@ def test_fit_finds_the_numbers_of_friction():
     assert_found(model.fit(X, y), {"stribeck_velocity": 0.3, "sharpness": 1.5}, 0.2)
 
 
-@pytest.mark.long
 def test_fit_finds_the_stiction_velocities_of_joints():
     rng = np.random.default_rng(0)
     X = rng.normal(size=(300, 6)) * [1.0, 1.0, 0.3, 0.3, 1.0, 1.0]
