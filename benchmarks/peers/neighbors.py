@@ -269,7 +269,7 @@ def main() -> None:
     ]
     fit = partial(run, known=known, pythons=pythons, folder=options.data, limit=options.limit)
     n_failures = harness.run_missing(cells, fit, output)
-    harness.write_page("Neighbours", tables_of(harness.frame(output)), output, n_failures)
+    harness.write_page("Nearest rows beside inducing points", tables_of(harness.frame(output)), output, n_failures)
 
 
 if __name__ == "__main__":

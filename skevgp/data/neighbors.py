@@ -38,9 +38,11 @@ class NearestRows:
     @cached_property
     def _dimension(self) -> float:
         """The number of columns over which the rows spread. Columns with a long length scale hardly count."""
-        variances = self.coordinates.var(axis=0)
-        # This is d for equal variances, and 1 if all but one are 0.
-        return float(variances.sum() ** 2 / max(np.square(variances).sum(), np.finfo(float).tiny))
+        # Of at most so many rows. Quartiles do not depend on a few rows that are far away.
+        rows = self.coordinates[:: max(len(self.coordinates) // _AT_ONCE, 1)]
+        squares = np.square(np.subtract(*np.quantile(rows, [0.75, 0.25], axis=0)))
+        # This is d for equal spreads, and 1 if all but one are 0.
+        return float(squares.sum() ** 2 / max(np.square(squares).sum(), np.finfo(float).tiny))
 
     @cached_property
     def _brute_force(self) -> NearestNeighbors:

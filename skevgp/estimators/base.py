@@ -92,8 +92,8 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     _fitted: Fitted
     # The posterior of the parameters of the feature map, if it has any.
     _theta: ThetaPosterior | None = None
-    # The share (o,) of the error that nearest rows would take away. None: it is not known.
-    _gain_of_neighbours: np.ndarray | None = None
+    # The share of the error that nearest rows would take away. None: it is not known.
+    _gain_of_neighbours: float | None = None
 
     def predict(
         self,

@@ -12,7 +12,6 @@ import numpy as np
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import ConstantKernel, Product
 
-from ..fitting.local import NEIGHBOURS_OF_ESTIMATE
 from ..fitting.prior import coef_names
 from ..fitting.theta import ThetaPosterior
 from ..utils.optional import require
@@ -23,7 +22,7 @@ _OF_A_JOINT = ("q", "q̇", "q̈", "torque")
 _LINES, _WIDTH = 40, 100
 # Maximum number of lines of a fact, such as a kernel of many columns.
 _FACT_LINES = 6
-# In percent: a smaller gain from the local part is not shown as a number.
+# In percent: a smaller gain from the local part is not shown.
 _LITTLE = 5
 _CELL = 'style="text-align: left; padding: 0 1em 0 0"'
 _TABLE = 'style="margin: 0.3em 0 1em 0; font-size: inherit"'
@@ -147,7 +146,8 @@ class ModelSummary:
 
     def _repr_html_(self) -> str:
         """Return tables, with all names escaped."""
-        parts = [f"<p><b>{escape(self.title)}</b><br>{escape(self.certificate)}<br>{escape(self.advice)}</p>"]
+        lines = "".join(f"<br>{escape(line)}" for line in (self.certificate, self.advice) if line)
+        parts = [f"<p><b>{escape(self.title)}</b>{lines}</p>"]
         for output, facts in self._facts():
             parts.append("" if output is None else f"<p>output <b>{escape(str(output))}</b></p>")
             parts.append(html_table(list(facts.items())))
@@ -313,13 +313,11 @@ def _certificate(lower: Any, upper: Any) -> str:
     return f"log marginal likelihood: from {lower:.2f} to {upper:.2f} nats"
 
 
-def _advice(gain: np.ndarray | None) -> str:
-    """Text on the share of the error of each output that a local part would take away."""
-    if gain is None:
+def _advice(gain: float | None) -> str:
+    """Text on the share of the error that a local part would take away."""
+    if gain is None or 100.0 * gain < _LITTLE:
         return ""
-    mean = 100.0 * (1.0 - np.exp(np.mean(np.log(np.maximum(1.0 - gain, np.finfo(float).tiny)))))
-    least = f"by about {mean:.0f} %" if mean >= _LITTLE else f"by less than {_LITTLE} %"
-    return f"n_neighbors={NEIGHBOURS_OF_ESTIMATE} would lower the error {least}"
+    return f"n_neighbors=60 would lower the error by at least about {100.0 * gain:.0f} %"
 
 
 def _plus_minus(value: float, std: float) -> str:

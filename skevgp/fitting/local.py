@@ -20,7 +20,7 @@ from ..solvers.lbfgs import Descent
 from ..utils.linalg import NotPositiveDefiniteError
 from .calibration import factor_in_doubt, means_of_groups
 from .doubts import of_residuals
-from .fitted import Fitted
+from .fitted import Fitted, FittedModel
 from .folds import FEWEST_ROWS, PREDICTED_ROWS, CrossValidation, Fold
 from .model import Model
 from .problem import Problem
@@ -42,12 +42,11 @@ _ROUNDS, _GAIN = 2, 2e-3
 _REACH, _CLOSE = 4.0, 0.1
 # With so many rows, one fold is enough.
 _ONE_FOLD = 2000
-# What a local part would gain is estimated for fits to so many rows, with this number of neighbours, on so many
-# left-out rows, among at most so many. With fewer rows, a fit with the local part takes seconds: one may try it.
-_FEWEST, NEIGHBOURS_OF_ESTIMATE = 3000, 60
-_JUDGED, _AMONG = 500, 100_000
-# The noise of a sparse fit explains what the inducing points leave out. So it is tried times these factors.
-_LESS_NOISE = (1.0, 0.1, 0.01, 0.001)
+# What a local part would gain is estimated for fits to so many rows: on this many rows of this many outputs, among at
+# most so many rows, with noise variances of these ratios to the variance of the kernel.
+_FEWEST, _JUDGED, _JUDGED_OUTPUTS, _AMONG, _RATIOS = 3000, 500, 3, 100_000, (1.0, 0.1, 0.01)
+# Mean squared errors below this share of the mean square of the residuals are almost rounding.
+_ROUNDED = 1e-10
 
 
 def with_local_part(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, Values]:
@@ -388,46 +387,68 @@ def _best_variances(
 # --- what a local part would gain -------------------------------------------------------------------------------------
 
 
-def gain_of_neighbours(problem: Problem, fitted: Fitted) -> np.ndarray | None:
-    """The share (o,) of the RMS error of left-out rows that their nearest rows would take away from a sparse fit.
+def gain_of_neighbours(problem: Problem, fitted: Fitted) -> float | None:
+    """The share of the RMS error of some rows that their nearest rows take away from a sparse fit.
 
-    Kernel and weights stay those of the sparse fit. A fit with the local part finds better ones and gains more. It is
-    None for few rows, for rows that depend on each other, and for models without a local part.
+    It is the geometric mean of a few outputs. A fit with the local part finds better kernels and has more neighbours,
+    so it gains more. None for few rows, for rows that depend on each other, and for models without a local part.
     """
-    variant, noise, source = problem.variant, problem.noise, problem.source
-    alike = problem.groups is not None or fitted.dependent
-    if variant.n_neighbors or variant.family != "full" or noise.heavy_tails or noise.inputs is not None or alike:
+    variant, noise, solver, source = problem.variant, problem.noise, problem.solver, problem.source
+    unsupported = solver.stochastic or solver.posterior != "full" or variant.orthogonal
+    if unsupported or noise.heavy_tails or noise.inputs is not None or variant.n_neighbors:
         return None
-    if not isinstance(source, LocalSource) or source.n_rows < _FEWEST:
+    if problem.groups is not None or fitted.dependent or not isinstance(source, LocalSource):
         return None
-    gains = np.zeros(problem.n_outputs)
+    if source.n_rows < _FEWEST:
+        return None
+    shares: list[float] = []
     for model in fitted.models:
-        if isinstance(model.posterior, SparsePosterior):
-            rows = problem.units.rows(source).outputs(model.outputs)
-            gains[model.outputs] = 1.0 - _error_with_neighbours(rows, model.posterior)
-    return gains
+        rows = problem.units.rows(source).outputs(model.outputs)
+        outputs = np.flatnonzero(~rows.is_constant())[: _JUDGED_OUTPUTS - len(shares)]
+        if isinstance(model.posterior, SparsePosterior) and len(outputs):
+            shares += _errors_with_neighbours(rows, model, model.posterior, outputs)
+    return 1.0 - float(np.exp(np.mean(np.log(shares)))) if shares else None
 
 
-def _error_with_neighbours(rows: Rows, posterior: SparsePosterior) -> np.ndarray:
-    """The RMS error (o,) of some rows from their nearest other rows too, as a share of that from inducing points."""
+def _errors_with_neighbours(
+    rows: Rows, model: FittedModel, posterior: SparsePosterior, outputs: np.ndarray
+) -> list[float]:
+    """The RMS error of some rows of each output from their nearest rows too, divided by that of the sparse fit.
+
+    Errors e of the sparse fit are predicted from those of the nearest rows, wᵀ e_N with w = (K_NN + ρ I)⁻¹ K_Ni. The
+    kernel and ρ are the best of a few. A sparse fit that takes details for noise has too long length scales.
+    """
     # The same rows for each fit, so that the random numbers of a user are not used up.
     rows, rng = _sample(rows, _AMONG, seed=0), np.random.RandomState(0)
     judged, raw = rows.chosen(_JUDGED, rng), rows.some(np.arange(len(rows)))
-    local = LocalModel.of(posterior.sparse, raw, NEIGHBOURS_OF_ESTIMATE + 1, np.arange(len(rows)))
-    known = local.known(values_by_output(posterior.sparse, posterior.values))
-    nearest = [_without(judged, own.nearest(own.inputs[judged])) for own in known]
-    used = np.unique(np.concatenate([judged, *map(np.ravel, nearest)]))
+    end, first = posterior.values, model.table.values_at_start()["hyperparameters"]
+    free = model.table["hyperparameters"].free.reshape(first.shape)
+    tried = [end["hyperparameters"], *(np.where(free, factor * first, first) for factor in _LENGTH_FACTORS)]
+    local = LocalModel.of(posterior.sparse, raw, _NEIGHBOURS + 1, np.arange(len(rows)))
+    known = [local.known(values_by_output(posterior.sparse, end | {"hyperparameters": one})) for one in tried]
+    # For each output, and for each kernel.
+    nearest = [
+        [_without(judged, of_kernel[output].nearest(raw.of([output]).inputs[judged])) for of_kernel in known]
+        for output in outputs
+    ]
+    used = np.unique(np.concatenate([judged, *(near.ravel() for of_output in nearest for near in of_output)]))
     mean, _ = of_residuals(posterior.predictor).predict(raw.inputs[used], raw.features[used])
-    residuals, judged, shares = raw.targets[used] - mean, np.searchsorted(used, judged), []
-    for output, (own, positions) in enumerate(zip(known, nearest, strict=True)):
-        of_output, near = replace(own.some(used), linear=residuals[:, [output]]), np.searchsorted(used, positions)
-        errors = np.empty((len(_LESS_NOISE), len(judged)))
-        for some in of_output.slices(*near.shape):
-            inputs, joint = of_output.inputs[judged[some]], of_output.joint(judged[some])
-            for index, factor in enumerate(_LESS_NOISE):
-                less_noisy = of_output.with_ratio(factor * of_output.ratio)
-                # r_i - wᵀ r_N, without v and β, whose means the residuals are about.
-                errors[index, some] = less_noisy.conditioned(near[some], inputs, joint).differences[:, -1]
-        alone = np.square(residuals[judged, output]).mean()
-        shares.append(np.sqrt(np.square(errors).mean(axis=1).min() / alone) if alone > 0.0 else 1.0)
-    return np.minimum(shares, 1.0)
+    errors, places = raw.targets[used] - mean, np.searchsorted(used, judged)
+    precision = np.ones(len(raw.inputs)) if raw.precision is None else raw.precision / rows.mean_precision
+    shares = []
+    for output, near_of_kernels in zip(outputs, nearest, strict=True):
+        alone, best = errors[places, output], np.inf
+        size = np.average(alone**2, weights=precision[judged])
+        for of_kernel, near in zip(known, near_of_kernels, strict=True):
+            own = of_kernel[output]
+            sets = own.inputs[np.column_stack([near, judged])]
+            K, _ = own.kernel.within(own.hyperparameters, sets)
+            variance = np.maximum(np.einsum("bkk->bk", K)[:, :-1], np.finfo(float).tiny) / precision[near]
+            for ratio in _RATIOS:
+                covariance = K[:, :-1, :-1] + ratio * variance[:, :, np.newaxis] * np.eye(near.shape[1])
+                weights = np.linalg.solve(covariance, K[:, :-1, -1:])[:, :, 0]
+                left = alone - np.einsum("bk,bk->b", weights, errors[np.searchsorted(used, near), output])
+                best = min(best, float(np.average(left**2, weights=precision[judged])))
+        rounding = _ROUNDED * rows.residuals.rms[rows.columns][output] ** 2
+        shares.append(float(np.sqrt(min(best / size, 1.0))) if size > rounding else 1.0)
+    return shares
