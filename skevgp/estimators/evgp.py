@@ -329,12 +329,12 @@ class EVGPRegressor(GaussianProcess):
                     fitted, data, posterior_of, numbers, covariance, refit, monitor, self._columns_changed
                 )
             theta = None if calibration is None else calibration.posterior
-            interrupted_fit, self._gain_of_neighbours = monitor.interrupted, None
-            if theta is None and problem.max_iter > 0 and not interrupted_fit:
+            self._gain_of_neighbours = None
+            if theta is None and problem.max_iter > 0 and not monitor.interrupted:
                 self._gain_of_neighbours = gain_of_neighbours(problem, fitted)
             self._set_posterior(data, problem, problem.spec, fitted, theta)
             self._set_attributes(fitted, data)
-        self._warn((interrupted(self.n_iter_),) if interrupted_fit else fitted.messages, problem.spec)
+        self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
         if calibration is not None:
             calibration.warn()
         if fitted.dependent:
