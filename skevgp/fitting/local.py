@@ -42,9 +42,9 @@ _ROUNDS, _GAIN = 2, 2e-3
 _REACH, _CLOSE = 4.0, 0.1
 # With so many rows, one fold is enough.
 _ONE_FOLD = 2000
-# What a local part would gain is estimated for fits to so many rows: on this many rows of this many outputs, among at
-# most so many rows, with noise variances of these ratios to the variance of the kernel.
-_FEWEST, _JUDGED, _JUDGED_OUTPUTS, _AMONG, _RATIOS = 3000, 500, 3, 100_000, (1.0, 0.1, 0.01)
+# What a local part would gain is estimated for fits to no fewer and no more rows than these: on this many rows of this
+# many outputs, with noise variances of these ratios to the variance of the kernel. More rows would need much memory.
+_FEWEST, _MOST, _JUDGED, _JUDGED_OUTPUTS, _RATIOS = 3000, 50_000, 500, 3, (1.0, 0.1, 0.01)
 # Mean squared errors below this share of the mean square of the residuals are almost rounding.
 _ROUNDED = 1e-10
 
@@ -391,7 +391,7 @@ def gain_of_neighbours(problem: Problem, fitted: Fitted) -> float | None:
     """The share of the RMS error of some rows that their nearest rows take away from a sparse fit.
 
     It is the geometric mean of a few outputs. A fit with the local part finds better kernels and has more neighbours,
-    so it gains more. None for few rows, for rows that depend on each other, and for models without a local part.
+    so it gains more. None for few or very many rows, for rows that depend on each other, and for models without a local part.
     """
     variant, noise, solver, source = problem.variant, problem.noise, problem.solver, problem.source
     unsupported = solver.stochastic or solver.posterior != "full" or variant.orthogonal
@@ -399,7 +399,7 @@ def gain_of_neighbours(problem: Problem, fitted: Fitted) -> float | None:
         return None
     if problem.groups is not None or fitted.dependent or not isinstance(source, LocalSource):
         return None
-    if source.n_rows < _FEWEST:
+    if not _FEWEST <= source.n_rows <= _MOST:
         return None
     shares: list[float] = []
     for model in fitted.models:
@@ -419,7 +419,7 @@ def _errors_with_neighbours(
     kernel and ρ are the best of a few. A sparse fit that takes details for noise has too long length scales.
     """
     # The same rows for each fit, so that the random numbers of a user are not used up.
-    rows, rng = _sample(rows, _AMONG, seed=0), np.random.RandomState(0)
+    rng = np.random.RandomState(0)
     judged, raw = rows.chosen(_JUDGED, rng), rows.some(np.arange(len(rows)))
     end, first = posterior.values, model.table.values_at_start()["hyperparameters"]
     free = model.table["hyperparameters"].free.reshape(first.shape)
