@@ -391,7 +391,7 @@ def gain_of_neighbours(problem: Problem, fitted: Fitted) -> float | None:
     """The share of the RMS error of some rows that their nearest rows take away from a sparse fit.
 
     It is the geometric mean of a few outputs. A fit with the local part finds better kernels and has more neighbours,
-    so it gains more. None for few or very many rows, for rows that depend on each other, and for models without a local part.
+    so it gains more. None for few or very many rows, for rows that depend on each other, and for other kinds of models.
     """
     variant, noise, solver, source = problem.variant, problem.noise, problem.solver, problem.source
     unsupported = solver.stochastic or solver.posterior != "full" or variant.orthogonal
