@@ -16,7 +16,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 _SKLEARN = tuple(int(part) for part in version("scikit-learn").split(".")[:2])
 _FRAMES = ["pandas.DataFrame", "polars.DataFrame"]
 if _SKLEARN >= (1, 7):
-    _FRAMES.append(pytest.param("pyarrow.table", marks=pytest.mark.long))  # type: ignore[arg-type]
+    _FRAMES.append(pytest.param("pyarrow.table", marks=pytest.mark.long))
 
 
 @pytest.fixture(params=_FRAMES)
@@ -30,6 +30,4 @@ def pytest_unconfigure(config):
     """Say in the last line how to run the rest."""
     if config.option.markexpr == "not long" and not hasattr(config, "workerinput"):
         rest = "pip install -e '.[physics,plot,dask,test-long]' && python -m pytest -n auto -m long"
-        config.get_terminal_writer().line(
-            f"These were the quick tests. The long ones, half an hour on two cores: {rest}"
-        )
+        config.get_terminal_writer().line(f"These were the quick tests. The long ones: {rest}")

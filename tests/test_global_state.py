@@ -80,8 +80,6 @@ def test_fits_and_predictions(name):
     model = clone((THREADED | OTHERS)[name])
     if name in THREADED:
         model.set_params(n_jobs=2)
-    if name == "adam":
-        model.set_params(sharing="all", noise_cv=None)
     model.fit(X, Y)
     model.predict(X_NEW, return_std=True)
     model.sample_y(X_NEW)

@@ -423,9 +423,13 @@ def _errors_with_neighbours(
     judged, raw = rows.chosen(_JUDGED, rng), rows.some(np.arange(len(rows)))
     end, first = posterior.values, model.table.values_at_start()["hyperparameters"]
     free = model.table["hyperparameters"].free.reshape(first.shape)
-    tried = [end["hyperparameters"], *(np.where(free, factor * first, first) for factor in _LENGTH_FACTORS)]
     local = LocalModel.of(posterior.sparse, raw, _NEIGHBOURS + 1, np.arange(len(rows)))
-    known = [local.known(values_by_output(posterior.sparse, end | {"hyperparameters": one})) for one in tried]
+    known = [local.known(values_by_output(posterior.sparse, end))]
+    # V is not used. So the whitening of the fit serves for all kernels.
+    whitenings = [own.whitening for own in known[0]]
+    for factor in _LENGTH_FACTORS:
+        values = end | {"hyperparameters": np.where(free, factor * first, first)}
+        known.append(local.known(values_by_output(posterior.sparse, values), whitenings))
     # For each output, and for each kernel.
     nearest = [
         [_without(judged, of_kernel[output].nearest(raw.of([output]).inputs[judged])) for of_kernel in known]
