@@ -12,7 +12,7 @@ from .cases import MODELS, D, quick
 @cache
 def rows():
     rng = np.random.RandomState(0)
-    X = rng.uniform(-2.0, 2.0, (80, D))
+    X = rng.uniform(-2.0, 2.0, (120, D))
     Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1], np.cos(X.sum(axis=1))])
     return X, Y + 0.05 * rng.randn(*Y.shape), rng.uniform(-2.0, 2.0, (9, D))
 
