@@ -17,7 +17,7 @@ from .blocks import AnyBlock, Blocks, LinearSums
 from .maps import EXAMPLE_ROWS, MappedRows, Maps, evenly_spaced, fit_map, fresh_map
 from .rows import LocalSource, RawRows
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
-from .weights import Chosen, check_variances, check_weights
+from .weights import SMALLEST_OF_MEDIAN, Chosen, check_variances, check_weights
 
 # A worker adds the sums of this many partitions at a time.
 _SUMMED_AT_ONCE = 8
@@ -100,9 +100,14 @@ class RowWeights:
         kept = None
         for chunks, check in ((counts, check_weights), (variance, check_variances)):
             if chunks is not None:
-                lowest, highest, positive = zip(*_dask().compute(*map(_dask().delayed(_range), chunks)), strict=True)
-                check(float(np.min(lowest)), float(np.max(highest)))
-                kept = np.array(positive) if chunks is counts else kept
+                found = _dask().compute(*map(_dask().delayed(_range), chunks))
+                lowest, median, highest, positive = np.array(found).T
+                check(float(lowest.min()), float(highest.max()))
+                if chunks is counts:
+                    kept = positive.astype(int)
+                else:
+                    smallest = SMALLEST_OF_MEDIAN * float(np.median(median))
+                    variance = [_dask().delayed(np.maximum)(chunk, smallest) for chunk in chunks]
         return cls(counts, variance, kept)
 
     def labels_of(self, labels: np.ndarray) -> np.ndarray:
@@ -241,9 +246,9 @@ def _partition(
     return LocalSource(MappedRows(X, X, y, maps, chosen), chosen.n_rows)
 
 
-def _range(values: np.ndarray) -> tuple[float, float, int]:
+def _range(values: np.ndarray) -> tuple[float, float, float, int]:
     values = as_floats(values, "sample_weight or relative_variance")
-    return float(values.min()), float(values.max()), int(np.count_nonzero(values))
+    return float(values.min()), float(np.median(values)), float(values.max()), int(np.count_nonzero(values))
 
 
 def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:

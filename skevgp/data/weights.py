@@ -13,6 +13,8 @@ from ..utils.validation import LARGEST, as_floats, is_dask, is_frame
 # Up to this many rows are sorted, which takes milliseconds.
 ORDERED_ROWS = 10_000
 _SMALLEST_VARIANCE = 1.0 / LARGEST
+# No noise variance is smaller than so much of the median: float64 would lose the other rows in the sums over rows.
+SMALLEST_OF_MEDIAN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class Chosen:
             check_weights(float(counts.min()), float(counts.max()))
         if variance is not None:
             check_variances(float(variance.min()), float(variance.max()))
+            variance = np.maximum(variance, SMALLEST_OF_MEDIAN * np.median(variance))
         positions, merged_into, unmerged = np.arange(n) if counts is None else np.flatnonzero(counts), None, None
         if ordered and len(positions) <= ORDERED_ROWS:
             order, starts = _sorted(X, y, positions, variance, groups)
