@@ -264,12 +264,13 @@ def _opened(data: bytes, trusted: Sequence[str]) -> tuple[Any, bool, dict[str, A
 def _made(data: bytes, trusted: list[str]) -> tuple[Any, bool]:
     """Return the model of a file, and whether its predictions were compared."""
     skops = require("skops.io", "Loading a model")
-    if unknown := sorted(set(skops.get_untrusted_types(data=data)) - set(trusted)):
+    needed = skops.get_untrusted_types(data=data)
+    if unknown := sorted(set(needed) - set(trusted)):
         raise ValueError(
             f"it holds {', '.join(unknown[:20])}, which is not trusted by default. If you trust its code, name it in "
             "trusted=[...]"
         )
-    content = skops.loads(data, trusted=trusted)
+    content = skops.loads(data, trusted=needed)  # skops copies the list for each part of the model
     if type(content) is not dict or content.keys() != {"model", "trial"}:
         raise ValueError("it is not a file of skevgp.io.save")
     model, trial = content["model"], content["trial"]
