@@ -51,12 +51,12 @@ ALL_TRIED, ALL_IMPROVED = theta_module._TRIED, theta_module._IMPROVED
 def few_starts(request, monkeypatch):
     """Trials of starts would take half of a small fit. Long tests have all of them."""
     if request.node.get_closest_marker("long") is None:
-        monkeypatch.setattr(theta_module, "_TRIED", 2)
-        monkeypatch.setattr(theta_module, "_IMPROVED", 1)
+        monkeypatch.setattr(theta_module, "_TRIED", 1)
+        monkeypatch.setattr(theta_module, "_IMPROVED", 0)
 
 
 def sparse(features=WAVE, **options):
-    return EVGPRegressor(features, **{"n_inducing": 12, "random_state": 0} | options)
+    return EVGPRegressor(features, **{"n_inducing": 12, "noise_cv": None, "random_state": 0} | options)
 
 
 def with_all_points(features=WAVE, **options):
@@ -162,6 +162,7 @@ def test_points_at_all_rows_give_exact_model(shared, discrepancy):
 
 def test_frequency_without_slope_at_its_median_is_learned(monkeypatch):
     monkeypatch.setattr(theta_module, "_TRIED", 8)
+    monkeypatch.setattr(theta_module, "_IMPROVED", 1)
 
     def cosine(X, w):
         return anp.cos(w * X[:, 0])
