@@ -195,13 +195,13 @@ def test_invalid_number_of_folds_raises(noise_cv):
         fitted(noise_cv=noise_cv)
 
 
-@pytest.mark.parametrize(("sharing", "groups"), [("all", None), ("none", GROUPS[:600])])
+@pytest.mark.parametrize(("sharing", "groups"), [("all", None), ("none", GROUPS[:300])])
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_same_bits_for_any_n_jobs(sharing, groups, monkeypatch):
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 64)
     monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
     monkeypatch.setattr("skevgp.data.blocks._BLOCK_NUMBERS", 64)
-    options = {"X": X[:600], "Y": Y[:600], "sharing": sharing, "max_iter": 3, "noise_cv": 3}
+    options = {"X": X[:300], "Y": Y[:300], "sharing": sharing, "max_iter": 3, "noise_cv": 3}
     fits = [fitted(groups, n_jobs=n_jobs, **options) for n_jobs in (1, 3)]
     np.testing.assert_array_equal(fits[0].noise_variance_, fits[1].noise_variance_)
     np.testing.assert_array_equal(fits[0].predict(X_NEW), fits[1].predict(X_NEW))
@@ -248,7 +248,7 @@ def test_trajectories_are_warned_of_even_if_their_noise_would_not_be_much_larger
 
 
 def _one_output():
-    X, Y = independent(1000)
+    X, Y = independent(500)
     return X, Y[:, 0]
 
 

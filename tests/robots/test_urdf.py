@@ -9,7 +9,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from skevgp.robots import inertial_parameters, load_robot, physical_consistency, write_urdf
 from skevgp.robots.loading import urdf_path
 
-ROBOTS = ["panda", "ur10", "kinova", "talos_left_arm", "tiago", "baxter", "double_pendulum_continuous", "xarm7"]
+# The large files are long.
+ROBOTS = ["panda", "ur10", "kinova", "double_pendulum_continuous", "xarm7"]
+ROBOTS += [pytest.param(name, marks=pytest.mark.long) for name in ("talos_left_arm", "tiago", "baxter")]
 
 # A base with a welded foot, two moving bodies, one with a tool welded to it at an angle, another on that.
 ARM = """<?xml version="1.0"?>
