@@ -120,7 +120,7 @@ def carrying(arm, model, seed, gains=1.0, mass=2.0):
 
 
 def test_frames_must_be_in_the_robots_order():
-    arm = Arm("pendulum")
+    arm = Arm("pendulum", dt=0.2)
     frame = pd.DataFrame(arm.X, columns=["q", "dq/dt", "d2q/dt2"])
     model = InverseDynamics("pendulum", n_inducing=0).fit(frame, arm.y)
     assert_allclose(model.predict(frame), InverseDynamics("pendulum", n_inducing=0).fit(arm.X, arm.y).predict(arm.X))
@@ -136,9 +136,15 @@ def test_payload_lies_in_its_interval(arm, rigid):
     nothing = rigid.estimate_payload(arm.X, arm.y, groups=arm.groups)
     assert nothing.mass_interval[0] < 0.0 < nothing.mass_interval[1]
     assert abs(nothing.mass) < 0.1
-    first = arm.groups == arm.groups[0]
-    one = [rigid.estimate_payload(arm.X[first], arm.y[first], groups=labels) for labels in (None, arm.groups[first])]
-    assert_array_equal(one[0].parameters, one[1].parameters)
+
+
+def test_payload_of_one_group_is_that_without_groups(changing, fitted):
+    first = changing.groups == 0
+    one, other = (
+        fitted.estimate_payload(changing.X[first], changing.y[first], groups=labels)
+        for labels in (None, changing.groups[first])
+    )
+    assert_array_equal(one.parameters, other.parameters)
 
 
 def test_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
@@ -159,7 +165,7 @@ def test_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
     assert_allclose(inertial_parameters(loaded), inertial_parameters(found), rtol=1e-6, atol=1e-9)
     assert_allclose(loaded.damping, found.damping, rtol=1e-9)
     with pytest.raises(ValueError, match="file"):
-        Arm("pendulum", n_groups=1).fit(n_inducing=0).write_urdf(tmp_path / "none.urdf")
+        Arm("pendulum", n_groups=1, dt=0.2).fit(n_inducing=0).write_urdf(tmp_path / "none.urdf")
 
 
 def with_masses(arm, factor):
@@ -172,20 +178,23 @@ def with_masses(arm, factor):
 
 @pytest.mark.parametrize("factor", [0.01, 0.15])
 def test_placeholder_masses_warn(factor):
-    arm = Arm("acrobot", n_groups=1)
+    arm = Arm("acrobot", n_groups=1, dt=0.2)
     with pytest.warns(ConvergenceWarning, match="model does not fit the torques"):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
 
 
-@pytest.mark.parametrize("n_inducing", [0, 5])
-@pytest.mark.parametrize("scale", [0.0, 1e-100, 1.0])
-def test_torques_that_are_the_models_own(scale, n_inducing):
-    arm = Arm("cartpole", dt=0.2)
-    body = RigidBodyRegressor("cartpole")
-    y = scale * (body.fit_transform(arm.X) @ body.coef_prior(2)[0])
+# Where no Gaussian process is confirmed, a fit with one ends as a fit without.
+@pytest.mark.parametrize(
+    ("robot", "scale", "n_inducing"),
+    [("pendulum", 0.0, 5), ("pendulum", 1e-100, 5), ("cartpole", 1.0, 5), ("cartpole", 1.0, 0)],
+)
+def test_torques_that_are_the_models_own(robot, scale, n_inducing):
+    arm = Arm(robot, n_groups=1, dt=0.2)
+    body = RigidBodyRegressor(robot)
+    y = scale * (body.fit_transform(arm.X) @ body.coef_prior(arm.nominal.nv)[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        model = InverseDynamics("cartpole", n_inducing=n_inducing, max_iter=10).fit(arm.X, y)
+        model = InverseDynamics(robot, n_inducing=n_inducing, max_iter=4).fit(arm.X, y)
     mean, std = model.predict(arm.X, return_std=True)
     assert_allclose(mean, y, atol=1e-4 * y.std() + 1e-6)
     assert np.isfinite(std).all()
@@ -278,7 +287,7 @@ def test_invalid_payloads_raise(arm, rigid):
     for name in ("mass_scale", "size"):
         with pytest.raises(ValueError, match=name):
             rigid.estimate_payload(arm.X, arm.y, **{name: 0.0})
-    free = InverseDynamics(n_inducing=0).fit(arm.X, arm.y)
+    free = InverseDynamics(n_inducing=0).fit(arm.X[:50, :3], arm.y[:50, 0])
     assert not hasattr(free, "estimate_payload")
 
 
@@ -288,8 +297,8 @@ def test_invalid_payloads_raise(arm, rigid):
 def test_torque_that_differs_from_move_to_move_makes_nothing_worse_than_physics():
     """A Gaussian process fits it in each training move."""
     rng, t = np.random.default_rng(0), np.arange(0.0, 20.0, 0.05)
-    X = np.concatenate([0.5 * trajectory(1, seed, dt=0.05) for seed in range(6)])
-    moves = np.repeat(np.arange(6), 200)
+    X = np.concatenate([0.5 * trajectory(1, seed, dt=0.1) for seed in range(6)])
+    moves = np.repeat(np.arange(6), 100)
     own = rng.uniform(0.0, 2.0 * np.pi, (6, 2))[moves]
 
     def torque(X):
@@ -298,8 +307,8 @@ def test_torque_that_differs_from_move_to_move_makes_nothing_worse_than_physics(
     y = torque(X) + 0.5 * np.sin(2.0 * X[:, 0] + own[:, 0]) + 0.3 * np.sin(X[:, 1] + own[:, 1])
     y += 0.05 * rng.normal(size=len(y))
     model, physics = (
-        InverseDynamics("pendulum", n_inducing=n_inducing, random_state=0).fit(X, y, groups=moves)
-        for n_inducing in (20, 0)
+        InverseDynamics("pendulum", n_inducing=n_inducing, max_iter=10, random_state=0).fit(X, y, groups=moves)
+        for n_inducing in (10, 0)
     )
     wave = np.column_stack([2.0 * np.sin(3.0 * t), 6.0 * np.cos(3.0 * t), -18.0 * np.sin(3.0 * t)])
     for new in (wave, 0.5 * trajectory(1, 99, dt=0.05)):
@@ -357,27 +366,29 @@ def test_update_lowers_the_error_of_the_rest_of_a_move(changing, fitted):
     assert (rest < 0.5 * first).all()
 
 
-@pytest.mark.parametrize("method", ["update", "check_log"])
-def test_fewer_than_three_moves_do_not_say_how_moves_differ(changing, method):
+def test_fewer_than_three_moves_do_not_say_how_moves_differ(changing):
     few = changing.groups < 2
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = InverseDynamics("acrobot", n_inducing=0).fit(
             changing.X[few], changing.y[few], groups=changing.groups[few]
         )
-    with pytest.raises(ValueError, match=r"at least 3 groups; got 2\. With load_log, one file is one group"):
-        getattr(model, method)(changing.X[:50], changing.y[:50])
+    for method in (model.update, model.check_log):
+        with pytest.raises(ValueError, match=r"at least 3 groups; got 2\. With load_log, one file is one group"):
+            method(changing.X[:50], changing.y[:50])
 
 
 def test_a_fit_without_a_group_has_rows_where_few_are_taken():
     """Every third row is of the same group."""
     X = trajectory(1, 0)[:148]
     y = X[:, 2] / 4.0 + 9.81 / 2.0 * np.sin(X[:, 0]) + 0.1 * np.random.default_rng(0).normal(size=len(X))
-    model = InverseDynamics("pendulum", max_rows=50, n_inducing=10).fit(X, y, groups=np.arange(len(X)) % 3)
+    model = InverseDynamics("pendulum", max_rows=50, n_inducing=5, max_iter=3).fit(X, y, groups=np.arange(len(X)) % 3)
     assert np.isfinite(model.predict(X)).all()
 
 
-def test_update_begins_anew_and_fit_resets_it(changing, fitted):
+def test_update_begins_anew_and_fit_resets_it():
+    changing = Changing(1.0, n_moves=3, dt=0.1)
+    fitted = changing.fit()
     model = copy.deepcopy(fitted)
     first, second = changing.move(200), changing.move(201)
     alone = copy.deepcopy(fitted).update(*second)
@@ -408,14 +419,14 @@ def test_log_of_a_wrong_shape_raises(rigid, arm, method):
 
 
 def test_ordinary_logs_fail_the_check_as_often_as_stated_and_loads_are_found():
-    machine = Changing(0.1)
+    machine = Changing(0.1, n_moves=10)
     model = machine.fit()
 
     def check(log, rate):
         return model.check_log(*log, dt=machine.dt, false_alarms_per_minute=rate)
 
     # A log has 10 s, so that a rate of 0.6 a minute is a probability of 0.1.
-    checks = [check(machine.move(seed), 0.6) for seed in range(300, 380)]
+    checks = [check(machine.move(seed), 0.6) for seed in range(300, 340)]
     assert np.mean([not one.fits for one in checks]) <= 0.3
     for one in checks:
         assert one.fits == (one.p_value >= 0.1) == (not one.joints)
@@ -431,7 +442,7 @@ def test_ordinary_logs_fail_the_check_as_often_as_stated_and_loads_are_found():
 
 
 def test_shift_that_hardly_changes_the_size_of_errors_does_not_fit():
-    machine = Changing(0.005, dt=0.02)
+    machine = Changing(0.005, n_moves=12, dt=0.02)
     model = machine.fit()
     logs = [machine.move(seed) for seed in range(400, 405)]
     checks = [model.check_log(X, y + [0.0, 0.1], dt=machine.dt) for X, y in logs]  # as large as the noise
@@ -458,9 +469,13 @@ def warnings_of(X, y, **data):
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_robot_at_rest_with_equal_rows_is_fitted():
-    X = np.repeat([0.1, 0.0, 0.0], 6) * np.ones((40, 1))
-    y = RigidBodyRegressor("ur5").fit_transform(X) @ RigidBodyRegressor("ur5").fit(X).coef_prior(6)[0]
-    model = InverseDynamics("ur5", random_state=0).fit(X, y.round(2), groups=np.arange(40) // 10)
+    """At rest the cart needs no force, and the pole does."""
+    X = np.repeat([0.1, 0.0, 0.0], 2) * np.ones((40, 1))
+    body = RigidBodyRegressor("cartpole").fit(X)
+    y = body.transform(X) @ body.coef_prior(2)[0]
+    model = InverseDynamics("cartpole", n_inducing=5, max_iter=5, random_state=0).fit(
+        X, y.round(2), groups=np.arange(40) // 10
+    )
     mean, std = model.predict(X[:1], return_std=True)
     assert_allclose(mean, y[:1], atol=0.02)
     assert ((std > 0.0) & (std < 1.0)).all()
@@ -474,9 +489,8 @@ def test_weaknesses_of_a_log_are_named():
     said = warnings_of(still, arm.torque(still) + 0.02 * np.random.default_rng(0).normal(size=arm.y.shape))
     assert any(one.startswith("['q2'] never move") for one in said)
     assert not any("opposite sign" in one for one in said)
-    said = warnings_of(arm.X, arm.y * [0.01, 1.0], groups=arm.groups)
+    said = warnings_of(arm.X, arm.y * [0.01, -1.0], groups=arm.groups)
     assert any(one.startswith("Torques of ['q1'] are at most") for one in said)
-    said = warnings_of(arm.X, arm.y * [1.0, -1.0], groups=arm.groups)
     assert any(one.startswith("Torques of ['q2'] have the opposite sign") for one in said)
     # A filter as long as a fifth of the log: few independent rows.
     few = Arm("acrobot", error=0.05, n_groups=1, dt=0.02)

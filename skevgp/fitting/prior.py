@@ -76,10 +76,10 @@ class CoefPrior(StatefulEstimator):
     >>> def gravity(X):
     ...     own, both = np.sin(X[:, 0]), np.sin(X[:, 0] + X[:, 1])
     ...     return np.stack([np.column_stack([own, both]), np.column_stack([0.0 * own, both])], axis=1)
-    >>> X = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
+    >>> X = np.random.default_rng(0).uniform(-3.0, 3.0, (100, 2))
     >>> y = gravity(X) @ [20.0, 5.0] + np.cos(2.0 * X)
     >>> prior = CoefPrior(shared=True)
-    >>> model = EVGPRegressor(FunctionTransformer(gravity), coef_prior=prior, n_inducing=20, random_state=0).fit(X, y)
+    >>> model = EVGPRegressor(FunctionTransformer(gravity), coef_prior=prior, n_inducing=10, random_state=0).fit(X, y)
     >>> model.coef_.round(1)
     array([20.,  5.])
     """

@@ -154,7 +154,7 @@ class IdentifiedRobot(TorqueRegression):
         >>> import numpy as np
         >>> from skevgp import InverseDynamics
         >>> from skevgp.features import RigidBodyRegressor
-        >>> X, body = np.random.default_rng(0).normal(size=(300, 18)), RigidBodyRegressor("ur5")
+        >>> X, body = np.random.default_rng(0).normal(size=(100, 18)), RigidBodyRegressor("ur5")
         >>> y = body.fit_transform(X) @ body.coef_prior(6)[0]
         >>> model = InverseDynamics("ur5", n_inducing=0)
         >>> with tempfile.TemporaryDirectory() as folder:

@@ -166,7 +166,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     >>> from skevgp import InverseDynamics
     >>> from skevgp.datasets import load_robot, perturb_robot
     >>> from skevgp.features import RigidBodyRegressor
-    >>> t = np.arange(0.0, 20.0, 0.01)
+    >>> t = np.arange(0.0, 10.0, 0.01)
     >>> q = np.sin(t) + 0.5 * np.sin(2.7 * t)
     >>> dq = np.gradient(q, t)
     >>> X = np.column_stack([q, dq, np.gradient(dq, t)])

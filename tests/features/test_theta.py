@@ -24,6 +24,7 @@ from skevgp.features import (
     RigidBodyRegressor,
     Uniform,
 )
+from skevgp.fitting import theta
 from skevgp.io import load, save
 from skevgp.robots import RigidBody, System, layout_of
 from skevgp.robots.systems import Link
@@ -298,6 +299,15 @@ def test_factors_undo_errors_of_the_model():
 
 # --- fits -------------------------------------------------------------------------------------------------------------
 
+QUICK = {"n_inducing": 10, "sharing": "all", "noise_cv": None, "random_state": 0}
+
+
+@pytest.fixture
+def few_starts(monkeypatch):
+    """Trials of starts would take half of a small fit."""
+    monkeypatch.setattr(theta, "_TRIED", 4)
+    monkeypatch.setattr(theta, "_IMPROVED", 1)
+
 
 def assert_found(model, expected, relative=0.1):
     for name, value in expected.items():
@@ -320,6 +330,7 @@ def test_fit_finds_wrong_mass_and_length():
 
 
 @pytest.mark.parametrize("kind", ["sine", pytest.param("levers", marks=pytest.mark.long)])
+@pytest.mark.usefixtures("few_starts")
 def test_fit_finds_the_offset_of_an_encoder(kind):
     offset, dt = 0.15, 0.01
     data = make_dynamics("pendulum", 4, 25, dt=dt, noise=0.001, random_state=0)
@@ -332,10 +343,11 @@ def test_fit_finds_the_offset_of_an_encoder(kind):
         # With one lever. Two would represent any offset.
         gravity = LinkGravity("pendulum", dt=dt, axes="x", parameters=parameters)
         features = FeatureUnion([("state", InertiaForce("pendulum", dt=dt)), ("gravity", gravity)])
-    model = EVGPRegressor(features, n_inducing=10, sharing="all", noise_cv=None, random_state=0)
+    model = EVGPRegressor(features, **QUICK)
     assert_found(model.fit(X, y), {"offset(q)": offset}, 0.3)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_fit_finds_the_numbers_of_friction():
     rng, dt = np.random.default_rng(0), 0.01
     X = rng.uniform(-1.0, 1.0, (100, 3))
@@ -346,10 +358,11 @@ def test_fit_finds_the_numbers_of_friction():
     parameters = {"stribeck_velocity": LogNormal(0.5, 0.5), "sharpness": Uniform(0.5, 2.5)}
     friction = Friction("pendulum", stiction_velocity=0.02, dt=dt, parameters=parameters)
     features = FeatureUnion([("state", InertiaForce("pendulum", dt=dt)), ("friction", friction)])
-    model = EVGPRegressor(features, n_inducing=10, sharing="all", noise_cv=None, random_state=0)
+    model = EVGPRegressor(features, **QUICK)
     assert_found(model.fit(X, y), {"stribeck_velocity": 0.3, "sharpness": 1.5}, 0.2)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_fit_finds_the_stiction_velocities_of_joints():
     rng = np.random.default_rng(0)
     X = rng.normal(size=(300, 6)) * [1.0, 1.0, 0.3, 0.3, 1.0, 1.0]
@@ -359,6 +372,6 @@ def test_fit_finds_the_stiction_velocities_of_joints():
     y = true.fit_transform(X) @ weights + 0.02 * rng.normal(size=(300, 2))
     parameters = {f"stiction_velocity(q{joint})": LogNormal(0.2, 1.0) for joint in (1, 2)}
     body = RigidBodyRegressor("acrobot", parameters=parameters)
-    fitted = EVGPRegressor(body, n_inducing=10, random_state=0).fit(X, y)
+    fitted = EVGPRegressor(body, **QUICK | {"sharing": "none"}).fit(X, y)
     assert_found(fitted, {"stiction_velocity(q1)": 0.1, "stiction_velocity(q2)": 0.3})
     assert "stiction_velocity(q1) [rad/s]" in str(fitted.summary())

@@ -16,7 +16,7 @@ DEGREE, MILLI = 180.0 / np.pi, 1e3
     ("system", "units", "sharing"),
     [
         # Degrees, and N mm.
-        ("pendulum", [DEGREE, DEGREE, MILLI], "auto"),
+        ("pendulum", [DEGREE, DEGREE, MILLI], "none"),
         # The cart in mm and mm/s.
         ("cartpole", [MILLI, 1.0, MILLI, 1.0, 1.0], "kernel"),
     ],

@@ -15,7 +15,7 @@ from skevgp.fitting.folds import (
 from ..oracle import left_out, problem, rows_of
 
 
-def small(n=300, **changes):
+def small(n=150, **changes):
     """A problem whose signal is far too low."""
     model, rows, table = problem(n=n, **changes)
     values = table.values(table.start())
@@ -87,7 +87,7 @@ def calibrated_rows(model, rows, table, values, by, threads=None):
     return calibrate(model, values, statistics, table, rows, by, 0)
 
 
-@pytest.mark.parametrize("groups", [None, np.repeat(np.arange(30), 10)])
+@pytest.mark.parametrize("groups", [None, np.repeat(np.arange(15), 10)])
 def test_bits_do_not_depend_on_the_number_of_threads(groups, monkeypatch):
     monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
     by, threads = CrossValidation(4, groups), BlockMap(3)

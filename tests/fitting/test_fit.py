@@ -118,7 +118,7 @@ def test_number_of_points_grows_from_few(monkeypatch):
     """Of a fast wave, ten and fifteen points show nothing: to them it is noise."""
     rng = np.random.RandomState(0)
     x = np.sort(rng.uniform(0.0, 6.0, (200, 1)), axis=0)
-    model = growing(**data_of(np.sin(15.0 * x) + 0.1 * rng.randn(200, 1), x), first=10, max_iter=200)
+    model = growing(**data_of(np.sin(15.0 * x) + 0.1 * rng.randn(200, 1), x), first=10, max_iter=60)
     more, found = grown(model)
     assert more.n_inducing > 30
     assert found.values["noise"] < 0.1 * model.scatter

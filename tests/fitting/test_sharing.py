@@ -8,7 +8,7 @@ from skevgp.utils.monitor import Monitor
 from .cases import data_of, fitted, problem_of
 
 
-def waves(frequencies, noise=0.01, n=400, seed=0):
+def waves(frequencies, noise=0.01, n=200, seed=0):
     """Sums of a few waves of random directions and phases: each output as rough as its frequency says."""
     rng = np.random.RandomState(seed)
     X = rng.uniform(-2.0, 2.0, (n, 2))
@@ -21,7 +21,7 @@ def waves(frequencies, noise=0.01, n=400, seed=0):
     return data_of(Y + noise * rng.randn(*Y.shape), X)
 
 
-AUTO = {"sharing": "auto", "n_inducing": 40, "kernel": RBF(1.0)}
+AUTO = {"sharing": "auto", "n_inducing": 30, "kernel": RBF(1.0)}
 
 
 def found(n_threads=1, rng=0, **changes):

@@ -32,7 +32,7 @@ def monitor(model):
 
 
 def test_steps_of_a_stream_are_predictions_of_its_log(monitor):
-    X, y = log(15.0, 2)
+    X, y = log(11.0, 2)
     y[200:208] += 2.0 * monitor.detectable_
     alarms = monitor.predict(X, y)
     assert 0 < alarms.sum() < 50

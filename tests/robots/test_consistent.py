@@ -11,16 +11,16 @@ from skevgp.robots import (
     physical_consistency,
 )
 
-UR10 = inertial_parameters(load_robot("ur10"))
+UR10 = inertial_parameters(load_robot("ur10"))[:3]
 SIZES = 0.5 * (np.abs(UR10).ravel() + 0.02)
 
 
 def estimate(seed, deviations=1.0, keep=1.0):
     """A wrong mean around the UR10's parameters, and its covariance: ``deviations`` of random directions."""
     rng = np.random.default_rng(seed)
-    directions = np.linalg.qr(rng.normal(size=(60, 60)))[0]
+    directions = np.linalg.qr(rng.normal(size=(UR10.size, UR10.size)))[0]
     factor = (SIZES * keep)[:, None] * directions * deviations
-    return UR10 + (factor @ rng.normal(size=60)).reshape(UR10.shape), factor @ factor.T
+    return UR10 + (factor @ rng.normal(size=UR10.size)).reshape(UR10.shape), factor @ factor.T
 
 
 def distance(parameters, mean, covariance):
@@ -38,15 +38,24 @@ def by_cholesky_factors(mean, covariance, seed):
     """The distance that a local solver reaches from a random start: J = L Lᵀ."""
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     lower = np.tril_indices(4)
+    symmetric = np.eye(16).reshape(-1, 4, 4) + np.eye(16).reshape(-1, 4, 4).swapaxes(1, 2)
+    linear = np.column_stack([from_pseudo_inertia(0.5 * one) for one in symmetric])
+
+    units = np.zeros((10, 4, 4))
+    units[np.arange(10), *lower] = 1.0
+
+    def factor(theta):
+        return np.einsum("t,tij->ij", theta, units)
 
     def off(theta):
-        factor = np.zeros((4, 4))
-        factor[lower] = theta
-        return whiten @ (from_pseudo_inertia(factor @ factor.T) - mean[0])
+        return whiten @ (linear @ (factor(theta) @ factor(theta).T).ravel() - mean[0])
 
-    return (
-        2.0 * least_squares(off, np.random.default_rng(seed).normal(size=10), xtol=1e-10, ftol=1e-10, max_nfev=300).cost
-    )
+    def slopes(theta):
+        products = units @ factor(theta).T
+        return whiten @ linear @ (products + products.swapaxes(1, 2)).reshape(10, 16).T
+
+    start = np.random.default_rng(seed).normal(size=10)
+    return 2.0 * least_squares(off, start, slopes, xtol=1e-10, ftol=1e-10, max_nfev=300).cost
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -60,7 +69,7 @@ def test_no_start_of_a_local_solver_gets_nearer(seed):
     assert distance(found, mean, covariance) < nearest * (1.0 + 1e-5)
 
 
-@pytest.mark.parametrize("covariance", [np.eye(60), np.zeros((60, 60))], ids=["free", "pinned"])
+@pytest.mark.parametrize("covariance", [np.eye(UR10.size), np.zeros((UR10.size, UR10.size))], ids=["free", "pinned"])
 def test_consistent_mean_is_returned_as_it_is(covariance):
     found = nearest_consistent(UR10, covariance)
     assert_array_equal(found, UR10)
@@ -80,9 +89,9 @@ def test_margin_is_kept_and_a_wider_one_costs_more():
 
 @pytest.mark.parametrize(("kind", "scale"), [("plain", 1e-6), ("stiff", 1.0), ("flat", 1e4), ("pinned", 1e-6)])
 def test_scales_do_not_matter_however_far_apart_deviations_are(kind, scale):
-    deviations = np.ones(60)
-    deviations[:20] = {"stiff": 1e-8, "flat": 1e4}.get(kind, 1.0)
-    keep = np.ones(60)
+    deviations = np.ones(UR10.size)
+    deviations[:10] = {"stiff": 1e-8, "flat": 1e4}.get(kind, 1.0)
+    keep = np.ones(UR10.size)
     keep[1::3] = 0.0 if kind == "pinned" else 1.0
     mean, covariance = estimate(0, deviations, keep)
     assert physical_consistency(mean).min() < 0.0

@@ -160,10 +160,11 @@ def test_locked_joints_stay_at_0_or_at_the_nearest_limit(name, joints, at):
 def test_robot_with_locked_joints_serves_simulation_and_features():
     arm = load_robot("panda", joints=ARM)
     assert make_dynamics(arm, 1, n_steps=5, random_state=0).data.shape == (5, 21)
-    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 40, 7))
-    torques = RigidBody(arm).forces(q, v, a)
+    two = load_robot("panda", joints=ARM[1:3])
+    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 40, 2))
+    torques = RigidBody(two).forces(q, v, a)
     X = np.hstack([q, v, a])
-    model = pickle.loads(pickle.dumps(InverseDynamics(arm, n_inducing=0).fit(X, torques)))
+    model = pickle.loads(pickle.dumps(InverseDynamics(two, n_inducing=0).fit(X, torques)))
     assert model.score(X, torques) > 0.9999
     for frame in ("panda_link7", "panda_finger_joint1"):  # of a joint that moves, and of one that is locked
         assert arm.frames[arm.getFrameId(frame)].parentJoint == 7
