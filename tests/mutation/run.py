@@ -33,7 +33,7 @@ def pytest(root: Path, *options: str, tests: list[str] | None = None) -> str:
     with DATA.with_name("printed.txt").open("w+") as printed:
         try:
             done = subprocess.run([*command, f"@{chosen}"], cwd=root, env=os.environ | paths, stdout=printed,
-                                  stderr=printed, timeout=1800)  # fmt: skip
+                                  stderr=printed, timeout=600)  # fmt: skip
         except subprocess.TimeoutExpired:
             return "timeout"
         printed.seek(0)
