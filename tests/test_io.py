@@ -37,8 +37,9 @@ from .saved_models import CASES, ROWS, STATES, X_NEW, X, Y, evgp, fitted, new_ro
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 # These continue with partial_fit, too.
 CONTINUED = ["groups", "adam-object", "student-t", "input-noise", "shared-weights", "words", "nominal"]
-# Others save what these do: a solver by its name instead of an object, and no features instead of some.
-_LONG = {"adam", "exact-plain"}
+# Others save what these do: a solver by its name instead of an object, no features instead of some, parameters
+# ("friction"), a robot as numbers (test_load_without_urdf_file), a regressor of torques ("physics-alone").
+_LONG = {"adam", "exact-plain", "auto-m", "factors", "nominal-of-a-model", "torques"}
 
 
 @pytest.fixture
