@@ -94,9 +94,9 @@ def test_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
 
 # --- files --------------------------------------------------------------------------------------------------------
 
-SHORT = {"n_inducing": 8, "max_iter": 3, "noise_cv": None, "random_state": 0}
+SHORT = {"n_inducing": 5, "max_iter": 1, "noise_cv": None, "random_state": 0}
 SAVED = [
-    EVGPRegressor(TREND, kernel_map=StandardScaler(), **SHORT),
+    EVGPRegressor(TREND, kernel_map=StandardScaler(), **SHORT | {"sharing": [[0], [1]]}),
     EVGPRegressor(TREND, solver=Adam(natural_gradient=True), **SHORT | {"sharing": "all"}),
     EVGPRegressor(TREND, solver=LBFGS(posterior="diagonal"), **SHORT | {"sharing": "none"}),
     EGPRegressor(

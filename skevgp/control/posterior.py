@@ -169,7 +169,7 @@ class Posterior:
         >>> from skevgp.datasets import make_dynamics
         >>> from skevgp.features import InertiaForceGravity
         >>> train = make_dynamics("pendulum", 2, random_state=0)
-        >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
+        >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=5, random_state=0)
         >>> model = model.fit(train.data, train.target, groups=train.groups)
         >>> mean, jacobian = model.value_and_jacobian([[0.1, 0.0, 0.0]])  # near the bottom: [A, B] of a linear model
         >>> jacobian.shape

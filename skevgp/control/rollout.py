@@ -100,7 +100,7 @@ def rollout(
     >>> from skevgp.datasets import make_dynamics
     >>> from skevgp.features import InertiaForceGravity
     >>> train, test = (make_dynamics("pendulum", n, random_state=s) for n, s in [(4, 0), (1, 1)])
-    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
+    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=5, random_state=0)
     >>> model = model.fit(train.data, train.target, groups=train.groups)
     >>> ahead = rollout(model, test.data[0, :2], test.data[:50, 2:], random_state=0)
     >>> ahead.samples.shape, ahead.mean.shape

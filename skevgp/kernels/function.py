@@ -65,7 +65,7 @@ class FunctionKernel(sk.Kernel):
     >>> kernel = ConstantKernel() * FunctionKernel(growing)
     >>> kernel
     1**2 * FunctionKernel(growing, period=2)
-    >>> X = np.linspace(0, 6, 60).reshape(-1, 1)
+    >>> X = np.linspace(0, 6, 40).reshape(-1, 1)
     >>> model = EVGPRegressor(kernel=kernel, n_inducing=10, random_state=0)
     >>> model.fit(X, X[:, 0] * np.sin(2 * np.pi * X[:, 0] / 1.8)).kernel_.k2
     FunctionKernel(growing, period=1.8)

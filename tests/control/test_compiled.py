@@ -61,11 +61,11 @@ def often():
 
 
 def test_threads_may_share_it_and_it_can_be_pickled(model, data, often):
-    rows = np.repeat(data[2], 8, axis=0)
+    rows = np.repeat(data[2], 4, axis=0)
     compiled = pickle.loads(pickle.dumps(model.compile()))
     expected = [compiled.value_and_jacobian(row, return_std=True) for row in data[2]]
     with ThreadPoolExecutor(8) as threads:
         found = list(threads.map(lambda row: compiled.value_and_jacobian(row, return_std=True), rows))
     for i, each in enumerate(found):
-        for one, other in zip(each, expected[i // 8], strict=True):
+        for one, other in zip(each, expected[i // 4], strict=True):
             np.testing.assert_array_equal(one, other)

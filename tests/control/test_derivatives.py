@@ -106,7 +106,7 @@ class Squashed(TransformerMixin, BaseEstimator):
     ("frame", "split"), [(None, "together"), (pd.DataFrame, "in a pipeline"), (polars.DataFrame, "of columns")]
 )
 def test_differences_take_steps_in_the_units_of_the_columns(data, unit, offset, frame, split):
-    X, Y, X_new = data
+    X, Y, X_new = data[0][:40], data[1][:40], data[2]
     names = slice(0, 2) if frame is None else ["a", "b"]
     centred, together = FunctionTransformer(lambda X: X - offset), FunctionTransformer(Squashed(unit, offset).transform)
     kernel_map = {

@@ -13,7 +13,7 @@ from skevgp.solvers import LBFGS
 from .cases import N_OUTPUTS, QUICK, D, own_features, quick
 from .test_derivatives import close, differences
 
-N, N_PATHS = 1500, 20_000
+N, N_PATHS = 1000, 8_000
 
 
 def test_functions_have_posterior_mean_and_covariance(model, data):

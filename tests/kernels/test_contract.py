@@ -181,7 +181,7 @@ def test_extreme_hyperparameters_and_distances_are_finite(name):
     covariance, hyperparameters = parsed(KERNELS[name])
     rng = np.random.RandomState(0)
     for inputs_scale in (1e-12, 1.0, 1e12):
-        points, inputs = inputs_scale * Z, inputs_scale * np.vstack([X, Z])
+        points, inputs = inputs_scale * Z, inputs_scale * np.vstack([X[:6], Z])
         for corner in (-5.0, 5.0, -30.0, 30.0):
             for which in (np.full(len(hyperparameters), True), rng.rand(len(hyperparameters)) < 0.5):
                 at_corner = np.where(which, 10.0**corner, hyperparameters)
@@ -189,7 +189,7 @@ def test_extreme_hyperparameters_and_distances_are_finite(name):
                 assert np.isfinite(at.matrix()).all()
                 assert np.isfinite(at.cross(prepared)).all()
                 assert np.isfinite(at.diagonal(prepared)).all()
-                for gradient in pulled_back(covariance, at_corner, points, inputs, random_bars(7, 47)):
+                for gradient in pulled_back(covariance, at_corner, points, inputs, random_bars(7, 13)):
                     assert np.isfinite(gradient).all()
 
 

@@ -103,8 +103,7 @@ TREES = {
 }
 
 
-@pytest.mark.parametrize("sharing", ["all", "none"])
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize(("name", "sharing"), [(name, "all" if name in REGISTERED else "none") for name in TREES])
 def test_inducing_points_at_all_rows_give_the_exact_gp(name, sharing):
     kernel = TREES[name]
     noise = None if "WhiteKernel" in str(kernel) else 0.02

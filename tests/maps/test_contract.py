@@ -362,7 +362,7 @@ def test_value_is_that_of_transform(name, transformer):
 
 
 def test_jacobian_is_the_derivative_of_transform(name, transformer):
-    n_rows = 200 if CASES[name][1] <= 6 else 20
+    n_rows = 60 if CASES[name][1] <= 6 else 20
     X = rows_of(name, n_rows)
     close(as_map(transformer, example=X).jacobian(X), differences(transformer.transform, X), 1e-6)
 
