@@ -126,8 +126,8 @@ def test_nasty_data_are_fitted_or_refused(rows, nasty, draws):
 @given(
     NASTY,
     st.sampled_from([1, 2, 3, 20, 60]),
-    st.sampled_from([{"n_inducing": "auto", "solver": LBFGS(max_inducing=30)}, {"n_inducing": 200},
-                     {"solver": Adam(batch_size=64, natural_gradient=True)}]),
+    st.sampled_from([{"n_inducing": "auto", "solver": LBFGS(max_inducing=30)}, {"n_inducing": 200, "sharing": "auto"},
+                     {"solver": Adam(batch_size=64, natural_gradient=True), "sharing": "none"}]),
     st.sampled_from([None, PolynomialFeatures(2)]),
 )  # fmt: skip
 @example(
@@ -137,10 +137,11 @@ def test_nasty_data_are_fitted_or_refused(rows, nasty, draws):
 @example({"of_rows": ["outlier", "constant"], "of_targets": ["heavy tails"]}, 20, {}, PolynomialFeatures(2))
 @example({"of_rows": ["denormal"], "of_targets": ["one row differs"]}, 60, {"solver": Adam()}, PolynomialFeatures(2))
 @example({"of_rows": ["tiny"], "of_targets": ["tiny"]}, 60, {}, PolynomialFeatures(2))
-@example({"of_rows": ["vast"], "of_targets": ["vast"]}, 60, {}, None)
+@example({"of_rows": ["vast"], "of_targets": ["vast"]}, 60, {"sharing": "auto"}, None)
 def test_many_nasty_rows_are_fitted_or_refused(nasty, n, options, feature_map):
     X, Y, contain = made_nasty(MANY[:n], WAVES[:n], **nasty)
-    model = EVGPRegressor(feature_map, **{"n_inducing": 10, "max_iter": 15, "random_state": 0} | options)
+    few = {"n_inducing": 10, "max_iter": 8, "sharing": "all", "random_state": 0}
+    model = EVGPRegressor(feature_map, **few | options)
     assert_fitted_or_refused(model, X, Y, contain)
 
 
