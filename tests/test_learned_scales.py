@@ -58,7 +58,7 @@ def most_probable_factors(weights):
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_scales_are_the_most_probable_ones_for_the_true_weights(kind, seed):
     """The data determine the weights to a hundredth of their prior standard deviation."""
     weights, fitted = problem(seed)[2], learned(kind, seed)

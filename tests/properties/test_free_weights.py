@@ -52,7 +52,7 @@ def test_what_features_represent_changes_neither_errors_nor_std(model, y):
         offset, offset_of_new = of_rows @ b[:, 0], of_new @ b[:, 0]
     else:
         offset, offset_of_new = ((H @ b).reshape(len(H), *y.shape[1:]) for H in (of_rows, of_new))
-    model = clone(model).set_params(max_iter=10)
+    model = clone(model).set_params(max_iter=6)
     mean, std = predictions_without(model, X, y, 0.0, NEW, 0.0)
     moved, moved_std = predictions_without(model, X, y, offset, NEW, offset_of_new)
     # Both fits start at the same place and take the same way, up to rounding.
