@@ -193,6 +193,7 @@ FILES = {
 )
 @example("cut", 0, 0)
 @example("number", 10**5 - 1, 0)
+@example("overwritten", ARM.index("revolute"), ord("A"))
 def test_damaged_files_are_read_or_refused(tmp_path_factory, name, kind, where, byte):
     read, write = FILES[name]
     folder = tmp_path_factory.mktemp("damaged")
