@@ -230,6 +230,12 @@ MODELS = {
 }
 
 
+def measure_of(model, gradient=True):
+    """Relative errors of figures, as a function of them."""
+    precisely = model.figures(model.precise, gradient)
+    return partial(precisely.errors, noise=model.precise.noise, largest=np.abs(model.problem.y).max())
+
+
 def errors(model, gradient=True, draws=1):
     """Relative errors of the library's figures; and the largest that come of a unit in the last place of doubles.
 
@@ -246,8 +252,7 @@ def errors(model, gradient=True, draws=1):
     library, inputs, kernel : dict of float
         Of the library; of the precise model whose inputs are off by a unit; and whose values of the kernel are as well.
     """
-    precisely = model.figures(model.precise, gradient)
-    measure = partial(precisely.errors, noise=model.precise.noise, largest=np.abs(model.problem.y).max())
+    measure = measure_of(model, gradient)
 
     def largest(moved):
         each = [measure(model.figures(moved(seed), gradient)) for seed in range(draws)]

@@ -1,6 +1,7 @@
 """Against 120 digits: what is lost to rounding. `tests/long/accuracy.py` has a table of many more problems."""
 
 from dataclasses import replace
+from functools import cache
 
 import mpmath
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from skevgp import EGPRegressor
 
-from .accuracy import MODELS, Problem, errors, jitter_of, sparse
+from .accuracy import MODELS, Problem, errors, jitter_of, measure_of, sparse
 from .precise import DIGITS
 
 SHAPE = {"n": 8, "m": 4, "d": 2, "p": 2}
@@ -22,9 +23,16 @@ def _digits():
         yield
 
 
+@cache
+def drawn(*of, seed):
+    """A problem that all models are given."""
+    return Problem.drawn(*of, seed=seed, **SHAPE)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_little_is_lost_at_a_ratio_of_1e8(name):
-    library, _, _ = errors(MODELS[name](Problem.drawn(1e8, 1e6, seed=1, **SHAPE)))
+    model = MODELS[name](drawn(1e8, 1e6, seed=1))
+    library = measure_of(model)(model.found())
     assert library["bound"] < 1e-8
     assert library["mean"] < 1e-8
     assert library["variance"] < 1e-6
@@ -38,7 +46,7 @@ def test_little_is_lost_at_a_ratio_of_1e8(name):
 @pytest.mark.parametrize("seed", [0])
 def test_with_k_nearly_singular_no_more_is_lost_than_doubles_of_its_values_lose(name, ratio, seed):
     """That is more than 1e-8 of the bound and 1e-6 of variances: no algorithm has them who has doubles of K."""
-    model = MODELS[name](Problem.drawn(ratio, 1e16, seed=seed, **SHAPE))
+    model = MODELS[name](drawn(ratio, 1e16, seed=seed))
     library, inputs, kernel = errors(model, gradient=False, draws=4)
     for figure, error in library.items():
         assert error < SLACK * max(kernel[figure], 1e-14), figure

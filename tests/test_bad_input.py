@@ -19,10 +19,10 @@ RNG = np.random.RandomState(0)
 X = RNG.randint(-100, 100, (40, 3)) / 32.0
 Y = np.column_stack([np.sin(X[:, 0]) + 0.5 * X[:, 1], X[:, 2] ** 2]) + 0.01 * RNG.randn(40, 2)
 # To find groups of outputs takes most of a small fit.
-QUICK = {"n_inducing": 8, "sharing": "all", "max_iter": 5, "random_state": 0}
+QUICK = {"n_inducing": 8, "sharing": "all", "max_iter": 2, "random_state": 0}
 ESTIMATORS = {
     "EVGPRegressor": EVGPRegressor(InertiaForce(), **QUICK),
-    "EGPRegressor": EGPRegressor(InertiaForce(), max_iter=5),
+    "EGPRegressor": EGPRegressor(InertiaForce(), max_iter=2),
     "ResidualRegressor": ResidualRegressor(EVGPRegressor(**QUICK)),
     "BayesianMLPRegressor": BayesianMLPRegressor((4,), max_iter=2, random_state=0),
     "InverseDynamics": InverseDynamics(n_inducing=5, max_iter=2, random_state=0),
@@ -113,7 +113,7 @@ CONTAINERS = {
 }
 
 
-@pytest.mark.parametrize(("name", "container"), crossed(CONTAINERS, ["float32", "backwards", "read-only"]))
+@pytest.mark.parametrize(("name", "container"), crossed(CONTAINERS, ["float32", "read-only"]))
 def test_containers_give_same_predictions(name, container, tmp_path):
     estimator = clone(ESTIMATORS[name])
     rows = CONTAINERS[container](X, tmp_path / "rows.bin")
@@ -206,7 +206,7 @@ BAD = {
 def test_overflowing_prior_scale_raises(kind):
     spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
     message = rf"^{spread} must not exceed 1e\+130 in size; "
-    model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=5)
+    model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=1)
     with pytest.raises(ValueError, match=message):
         model.fit(1e12 * X, 1e-110 * Y)
     assert np.isfinite(model.fit(1e12 * X, 1e-80 * Y).predict(1e12 * X, return_std=True)).all()
@@ -368,7 +368,7 @@ def test_map_is_called_few_times():
             rows.append(len(X))
             return super().transform(X)
 
-    model = EVGPRegressor(Slow(), kernel_map=Slow(degree=1), n_inducing=8, random_state=0, max_iter=200).fit(X, Y)
+    model = EVGPRegressor(Slow(), kernel_map=Slow(degree=1), n_inducing=8, random_state=0, max_iter=30).fit(X, Y)
     assert model.n_iter_ > 20
     assert sum(rows) <= 8 * len(X)
 
@@ -380,7 +380,7 @@ def test_map_is_called_few_times():
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(2)], ids=["plain", "features"])
 def test_one_to_three_rows_are_fitted(kind, n, feature_map):
-    model = kind(feature_map, max_iter=50, random_state=0).fit(X[:n], Y[:n])
+    model = kind(feature_map, max_iter=10, random_state=0).fit(X[:n], Y[:n])
     mean, std = model.predict(X, return_std=True)
     assert mean.shape == std.shape == Y.shape
     assert np.isfinite(mean).all()

@@ -26,7 +26,13 @@ def test_input_noise_of_linear_function():
     x = rng.uniform(-1.0, 1.0, (2500, 2))
     X, y = x + [0.1, 0.05] * rng.randn(2500, 2), x @ [2.0, -1.0] + 0.1 * rng.randn(2500)
     kernel = ConstantKernel(1e-8, "fixed") * RBF(1.0, "fixed")
-    options = {"kernel": kernel, "n_inducing": 5, "coef_prior": CoefPrior(scale=10.0), "random_state": 0}
+    options = {
+        "kernel": kernel,
+        "n_inducing": 5,
+        "coef_prior": CoefPrior(scale=10.0),
+        "noise_cv": None,
+        "random_state": 0,
+    }
     plain = EVGPRegressor(FunctionTransformer(), **options).fit(X, y)
     found = EVGPRegressor(FunctionTransformer(), noise=Gaussian(inputs=[0.1, 0.05]), **options).fit(X, y)
     by_inputs = (2.0 * 0.1) ** 2 + 0.05**2
@@ -42,7 +48,7 @@ def test_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
     rng = np.random.RandomState(0)
     X = rng.uniform(-1.0, 1.0, (40, 2))
     Y = np.sin(X @ [[2.0, 1.0], [1.0, 3.0]])
-    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, solver=LBFGS(tol=1e6)).fit(X, Y)
+    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, sharing="all", solver=LBFGS(tol=1e6)).fit(X, Y)
     covariance = np.array([[0.04, 0.01], [0.01, 0.02]])
     slopes = model.jacobian(X)
     found = variance_by_inputs(model, X, Y, covariance)
@@ -60,6 +66,7 @@ def test_input_noise_with_frames_weights_and_partial_fit(sharing):
         noise=Gaussian(inputs=np.diag([0.01, 0.0])),
         sharing=sharing,
         n_inducing=8,
+        noise_cv=None,
         solver=LBFGS(tol=1e6),
     )
     model.fit(frame, Y, sample_weight=np.arange(80) % 3)

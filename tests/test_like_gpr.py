@@ -121,7 +121,9 @@ def test_optimizer_of_user_finds_what_lbfgs_does():
     def global_search(objective, theta, bounds):
         seen.append((theta, bounds))
         near = np.clip(bounds, theta[:, np.newaxis] - 3.0, theta[:, np.newaxis] + 3.0)
-        found = differential_evolution(lambda at: objective(at, eval_gradient=False), near, seed=0, maxiter=20)
+        found = differential_evolution(
+            lambda at: objective(at, eval_gradient=False), near, seed=0, popsize=6, maxiter=10
+        )
         return found.x, found.fun
 
     kernel = ConstantKernel(2.0, (0.1, 50.0)) * RBF(1.0, (0.1, 10.0)) + WhiteKernel(0.02, (1e-3, 1.0))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import CoefPrior, EVGPRegressor
@@ -25,6 +26,27 @@ def test_rows_on_top_of_each_other_count_as_one_place():
     model = EVGPRegressor(n_inducing=100, solver=LBFGS(tol=1.0)).fit(X, y)
     assert model.inducing_points_.shape == (4, 1)
     np.testing.assert_allclose(model.predict([[0.0], [3.0]]), [0.0, 3.0], atol=0.2)
+
+
+@pytest.mark.parametrize("n", [1, 20])
+def test_rows_at_one_place_have_no_neighbours_to_learn_from(n):
+    """Warnings are errors here: that the noise explains everything is as it should be."""
+    y = 1.0 + np.random.RandomState(0).randn(n)
+    model = EVGPRegressor(n_inducing=1, normalize_y=True, noise_cv=None, random_state=0).fit(np.ones((n, 2)), y)
+    assert model.predict(np.ones((1, 2))) == pytest.approx(y.mean(), abs=1e-6)
+
+
+def test_outliers_that_are_too_many_are_noise():
+    """A third of the rows: their scatter as noise of all rows is far likelier than so many large scales."""
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (60, 1))
+    y = np.sin(2.0 * X[:, 0]) + 0.05 * rng.randn(60)
+    y[:20] += 20.0 * np.tile([-1.0, 1.0], 10)
+    model = EVGPRegressor(noise="student-t", n_inducing=10, random_state=0)
+    with pytest.warns(ConvergenceWarning, match="of the rows are far from the prediction"):
+        model.fit(X, y)
+    assert model.weights_.min() > 0.9
+    assert np.sqrt(model.noise_variance_) == pytest.approx(20.0 / np.sqrt(3.0), rel=0.2)
 
 
 @pytest.mark.parametrize("constant", [0.1, 0.3, 1e8 + 0.1])

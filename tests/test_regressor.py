@@ -35,14 +35,15 @@ def model(**arguments):
 @pytest.mark.parametrize(("y", "outputs"), [(Y[:, 0], ()), (Y[:, :1], ()), (Y, (2,))])
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_shapes_of_attributes(y, outputs, sharing):
-    m = model(feature_map=PolynomialFeatures(1), sharing=sharing, solver=LBFGS(tol=1e9)).fit(X, y)
+    m = model(feature_map=PolynomialFeatures(1), sharing=sharing, n_inducing=10, noise_cv=None, solver=LBFGS(tol=1e9))
+    m.fit(X, y)
     assert m.coef_.shape == m.coef_std_.shape == (*outputs, 3)
     assert m.coef_prior_mean_.shape == m.coef_prior_scale_.shape == (*outputs, 3)
     assert m.coef_cov_.shape == (*outputs, 3, 3)
     assert np.shape(m.noise_variance_) == outputs
     assert isinstance(m.noise_variance_, float) == (outputs == ())
     n_sets = () if sharing == "all" else outputs
-    assert m.inducing_points_.shape == (*n_sets, 20, 2)
+    assert m.inducing_points_.shape == (*n_sets, 10, 2)
     assert isinstance(m.kernel_, list) == (outputs != ())
     assert m.loss_curve_.shape == (m.n_iter_,)
 
@@ -84,8 +85,9 @@ def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
     )
 
 
-def test_adam_ends_on_few_rows_when_the_loss_is_flat():
-    """The optimum of q for a fixed kernel, which L-BFGS has in closed form."""
+def test_adam_ends_on_few_rows_when_the_loss_is_flat(monkeypatch):
+    """The optimum of q for a fixed kernel, which L-BFGS has in closed form; it may end earlier than elsewhere."""
+    monkeypatch.setattr("skevgp.solvers.adam._FEWEST", 200)
     fixed = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], "fixed") + WhiteKernel(0.01, "fixed")
     x, y, arguments = X[:5], Y[:5, 0], {"n_inducing": 2, "kernel": fixed, "noise_cv": None}
     lbfgs, adam = (model(solver=solver, **arguments).fit(x, y) for solver in ("lbfgs", "adam"))
@@ -126,9 +128,10 @@ def test_natural_gradients_are_of_the_full_posterior():
         (5, 0, 100, 4, 2813),
         (5, 5, 60, 4, 1733),
         (5, 6, 60, 4, 1741),
-        (5, 0, 250, 4, 7013),
-        (5, 5, 150, 4, 4253),
-        (5, 7, 150, 4, 4269),
+        # As the others, with more points.
+        pytest.param(5, 0, 250, 4, 7013, marks=pytest.mark.long),
+        pytest.param(5, 5, 150, 4, 4253, marks=pytest.mark.long),
+        pytest.param(5, 7, 150, 4, 4269, marks=pytest.mark.long),
     ],
 )
 def test_parameter_counts_are_the_papers(n_columns, n_features, m, outputs, expected):
@@ -160,7 +163,7 @@ def test_scale_of_zero_keeps_a_weight_at_its_mean():
     m = model(
         feature_map=PolynomialFeatures(1),
         coef_prior=CoefPrior(mean=[1.0, 2.0, 3.0], scale=[1.0, 0.0, 1.0]),
-        solver=LBFGS(tol=1.0),
+        solver=LBFGS(tol=1e9),
     )
     m.fit(X, Y[:, 0])
     assert m.coef_[1] == 2.0

@@ -27,7 +27,7 @@ NOISE = np.exp(RNG.randn(N))
 
 
 def evgp(**parameters):
-    return EVGPRegressor(**{"n_inducing": 9, "max_iter": 6, "sharing": "all", "random_state": 0, **parameters})
+    return EVGPRegressor(**{"n_inducing": 9, "max_iter": 3, "sharing": "all", "random_state": 0, **parameters})
 
 
 MODELS = {
@@ -37,11 +37,11 @@ MODELS = {
     "not stationary": evgp(kernel=RBF() + DotProduct(), sharing="kernel"),
     "diagonal": evgp(solver=LBFGS(posterior="diagonal"), sharing="none"),
     "all rows": evgp(n_inducing=200),
-    "auto": evgp(n_inducing="auto", solver=LBFGS(max_inducing=15)),
+    "auto": evgp(n_inducing="auto", solver=LBFGS(max_inducing=12), noise_cv=None),
     "adam": evgp(solver=Adam(batch_size=16), max_iter=10),
     "natural": evgp(solver=Adam(batch_size=16, natural_gradient=True), max_iter=10),
-    "exact": EGPRegressor(PolynomialFeatures(1), max_iter=5),
-    "vague": EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=np.inf), max_iter=5, normalize_y=True),
+    "exact": EGPRegressor(PolynomialFeatures(1), max_iter=2),
+    "vague": EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=np.inf), max_iter=2, normalize_y=True),
     "network": BayesianMLPRegressor((8,), max_iter=5, random_state=0),
     "early": BayesianMLPRegressor((8,), max_iter=5, early_stopping=True, random_state=0),
     "residual": ResidualRegressor(evgp()),
@@ -77,9 +77,8 @@ def test_variance_that_all_rows_have_is_only_a_unit(kind):
     rng = np.random.RandomState(0)
     rows = rng.randn(40, 2)
     y = rows @ [1.0, 2.0] + 0.1 * rng.randn(40)
-    models = [
-        kind(PolynomialFeatures(1)).fit(rows, y, relative_variance=np.full(40, v)) for v in (1.0, 1e-100, 1e24, 1e100)
-    ]
+    model = kind(PolynomialFeatures(1), max_iter=10)
+    models = [clone(model).fit(rows, y, relative_variance=np.full(40, v)) for v in (1.0, 1e-100, 1e24, 1e100)]
     bounds = [getattr(m, "lower_bound_" if kind is EVGPRegressor else "log_marginal_likelihood_value_") for m in models]
     np.testing.assert_allclose(bounds, bounds[0], atol=0.1)
 
@@ -129,14 +128,15 @@ def test_partial_fit_with_weights_is_one_pass(posterior):
     assert_same(begun, evgp(solver=LBFGS(posterior=posterior), max_iter=5).fit(X[first], Y[first], NOISE[first]))
 
 
-@pytest.mark.parametrize("unit", [1e-8, 1e8])
-def test_partial_fit_after_an_exact_fit_does_not_depend_on_the_unit_of_variances(unit):
+def test_partial_fit_after_an_exact_fit_does_not_depend_on_the_unit_of_variances():
     def predicted(unit):
-        model = EVGPRegressor(n_inducing=N, random_state=0)
+        model = EVGPRegressor(n_inducing=N, max_iter=15, random_state=0)
         model.fit(X[:20], X[:20, 0] ** 2, relative_variance=np.full(20, unit))
         return model.partial_fit(X[20:], X[20:, 0] ** 2, relative_variance=np.full(N - 20, unit)).predict(X)
 
-    np.testing.assert_allclose(predicted(unit), predicted(1.0), atol=1e-3)
+    expected = predicted(1.0)
+    for unit in (1e-8, 1e8):
+        np.testing.assert_allclose(predicted(unit), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("as_dask", [True, False])

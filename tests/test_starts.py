@@ -92,7 +92,7 @@ def test_given_points_replace_n_inducing_and_stay_without_iterations():
     np.testing.assert_allclose(
         model(inducing_init=Z.tolist(), sharing="kernel", max_iter=0).fit(X, Y).inducing_points_, [Z, Z], atol=1e-14
     )
-    assert model(inducing_init=Z).fit(X, Y).lower_bound_ > m.lower_bound_
+    assert model(inducing_init=Z, solver=LBFGS(tol=10.0)).fit(X, Y).lower_bound_ > m.lower_bound_
 
 
 @pytest.mark.parametrize(
@@ -117,8 +117,8 @@ def test_invalid_inducing_points(init, message):
 
 def test_noise_that_explains_everything_warns():
     """One inducing point cannot follow forty waves, whatever the start."""
-    x = np.linspace(0, 1, 2000)[:, np.newaxis]
-    y = np.column_stack([np.sin(80 * np.pi * x[:, 0]), np.random.RandomState(0).randn(2000)])
+    x = np.linspace(0, 1, 800)[:, np.newaxis]
+    y = np.column_stack([np.sin(80 * np.pi * x[:, 0]), np.random.RandomState(0).randn(800)])
     with pytest.warns(
         ConvergenceWarning, match=r"noise explains the whole residual .* for 1 of 2 outputs .* raise n_inducing"
     ):

@@ -52,7 +52,7 @@ class LearningCurveDisplay:
     >>> from skevgp.plotting import LearningCurveDisplay
     >>> train, test = (make_dynamics("pendulum", 4, 10, random_state=seed) for seed in (0, 1))
     >>> display = LearningCurveDisplay.from_estimator(
-    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=5, random_state=0),
+    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=5, sharing="all", random_state=0),
     ...     *(train.data, train.target, test.data, test.target),
     ...     sizes=[1, 4],
     ...     groups=train.groups,

@@ -51,8 +51,8 @@ class RolloutDisplay:
     >>> from skevgp.datasets import make_dynamics
     >>> from skevgp.features import InertiaForceGravity
     >>> from skevgp.plotting import RolloutDisplay
-    >>> train, test = (make_dynamics("pendulum", n, random_state=s) for n, s in [(4, 0), (1, 1)])
-    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
+    >>> train, test = (make_dynamics("pendulum", n, 60, random_state=s) for n, s in [(4, 0), (1, 1)])
+    >>> model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, sharing="all", random_state=0)
     >>> model = model.fit(train.data, train.target, groups=train.groups)
     >>> ahead = rollout(model, test.data[0, :2], test.data[:50, 2:], random_state=0)
     >>> truth = test.trajectories[0, 1:51]

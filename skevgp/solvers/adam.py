@@ -75,7 +75,7 @@ class Adam(MiniBatchSolver):
     >>> from skevgp.datasets import make_toy
     >>> from skevgp.solvers import Adam
     >>> X, y = make_toy(random_state=0, return_X_y=True)
-    >>> model = EVGPRegressor(n_inducing=10, solver=Adam(50), max_iter=500, noise_cv=None).fit(X, y)
+    >>> model = EVGPRegressor(n_inducing=10, solver=Adam(50), max_iter=100, noise_cv=None).fit(X, y)
     >>> model.get_params()["solver__batch_size"]
     50
     """

@@ -24,7 +24,8 @@ X_NEW, H_NEW = RNG.randn(7, 2), RNG.randn(7, 3)
 SETTINGS = [each for each in product((1, 2), (False, True), (False, True), (0, 3)) if each[3] or not each[1]]
 # A diagonal posterior has no shared weights.
 SPARSE = [
-    (family, tight, *each)
+    # Of the bound, the groups and the weights of rows, each pair is a quick test, with all of the others.
+    pytest.param(family, tight, *each, marks=[pytest.mark.long] if (tight + each[0] + each[2]) % 2 else [])
     for family, tight, each in product(("full", "diagonal"), (False, True), SETTINGS)
     if family == "full" or not each[1]
 ]

@@ -55,7 +55,7 @@ def parts(n, n_folds, seed=3):
 
 
 def assert_as_refitted(model, values, rows, folds, joint=False, rtol=1e-8, **weights):
-    """At signal and noise variances around and far from those of ``values``."""
+    """At noise variances, and ratios of the signal to them, around and far from those of ``values``."""
     groups, n_outputs = left_out(model, values, rows, folds, **weights), len(values["noise"])
     where = [(group, index) for group in groups for index in range(len(group[0].group.noise))]
     relative = {}
@@ -68,25 +68,22 @@ def assert_as_refitted(model, values, rows, folds, joint=False, rtol=1e-8, **wei
             known = prior_of(group[k].group, index)
             for other in others:
                 known = known + where[other][0][k].says(where[other][1])
-            for factor in (1e-4, 1.0, 30.0):
-                signal = 0.4 * factor * values["signal"][o]
-                noise = values["noise"][o] * np.array([1e-3, 1.0, 20.0])
-                for s2 in noise:
-                    ratio = signal / s2
-                    found = group[k].predicted(index, ratio, noise, known)
-                    for i, n2 in enumerate(noise):
-                        expected = refitted(
-                            model,
-                            values,
-                            rows,
-                            [o, *others],
-                            [ratio * n2, *values["signal"][others]],
-                            [n2, *values["noise"][others]],
-                            out,
-                            **relative,
-                        )
-                        for own, oracle in zip(found, expected, strict=True):
-                            np.testing.assert_allclose(own[:, min(i, own.shape[1] - 1)], oracle, rtol=rtol, atol=1e-9)
+            noise = values["noise"][o] * np.array([1e-3, 1.0, 20.0])
+            for ratio in 0.4 * values["signal"][o] / values["noise"][o] * np.array([5e-6, 1.0, 3e4]):
+                found = group[k].predicted(index, ratio, noise, known)
+                for i, n2 in enumerate(noise):
+                    expected = refitted(
+                        model,
+                        values,
+                        rows,
+                        [o, *others],
+                        [ratio * n2, *values["signal"][others]],
+                        [n2, *values["noise"][others]],
+                        out,
+                        **relative,
+                    )
+                    for own, oracle in zip(found, expected, strict=True):
+                        np.testing.assert_allclose(own[:, min(i, own.shape[1] - 1)], oracle, rtol=rtol, atol=1e-9)
 
 
 @pytest.mark.parametrize(("features", "n_folds"), [(3, 2), (0, 3), (3, 30)])

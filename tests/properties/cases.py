@@ -23,7 +23,7 @@ from skevgp.solvers import LBFGS, Adam
 
 def fewer(by):
     """Settings of a test that takes long."""
-    return settings(max_examples=max(settings.default.max_examples // by, 2))
+    return settings(max_examples=max(settings.default.max_examples // by, 3))
 
 
 @dataclass(frozen=True)

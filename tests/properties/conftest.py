@@ -8,7 +8,7 @@ _MANY = os.environ.get("SKEVGP_EXAMPLES")
 # Before the tests are read, which take fractions of the number.
 settings.register_profile(
     "skevgp",
-    max_examples=int(_MANY or 12),
+    max_examples=int(_MANY or 6),
     derandomize=_MANY is None,
     database=None,
     deadline=None,

@@ -28,7 +28,7 @@ EVGP = EVGPRegressor(LINE, n_inducing=10, random_state=0)
 MODELS = {
     "sparse": (EVGP, Y[:, 0]),
     "exact": (EGPRegressor(LINE), Y[:, 0]),
-    "two outputs": (EVGP, Y),
+    "two outputs": (clone(EVGP).set_params(sharing="kernel"), Y),
     "shared": (clone(EVGP).set_params(feature_map=OF_EACH, coef_prior=CoefPrior(shared=True)), Y),
     "shared, exact": (EGPRegressor(OF_EACH, coef_prior=CoefPrior(shared=True)), Y),
     "student-t": (clone(EVGP).set_params(noise="student-t"), Y[:, 0]),
@@ -42,6 +42,7 @@ def predictions_without(model, X, y, offset, new, offset_of_new):
     return mean - offset_of_new, std
 
 
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize(("model", "y"), MODELS.values(), ids=MODELS)
 def test_what_features_represent_changes_neither_errors_nor_std(model, y):
     of_rows, of_new = (np.asarray(clone(model.feature_map).fit_transform(rows)) for rows in (X, NEW))
@@ -51,9 +52,10 @@ def test_what_features_represent_changes_neither_errors_nor_std(model, y):
         offset, offset_of_new = of_rows @ b[:, 0], of_new @ b[:, 0]
     else:
         offset, offset_of_new = ((H @ b).reshape(len(H), *y.shape[1:]) for H in (of_rows, of_new))
+    model = clone(model).set_params(max_iter=6)
     mean, std = predictions_without(model, X, y, 0.0, NEW, 0.0)
     moved, moved_std = predictions_without(model, X, y, offset, NEW, offset_of_new)
-    # Both fits end within their tolerance of the same optimum.
+    # Both fits start at the same place and take the same way, up to rounding.
     np.testing.assert_array_less(np.abs(moved - mean), 0.05 * std)
     np.testing.assert_allclose(moved_std, std, rtol=0.02)
 

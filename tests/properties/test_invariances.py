@@ -49,8 +49,7 @@ def assert_same_value(one, other, shift=0.0):
 # --- rows: the same bits, so that iterations that follow are the same too -------------------------------------------
 
 
-@fewer(2)
-@given(learned_cases(), st.data())
+@given(learned_cases(most_outputs=2), st.data())
 def test_order_of_rows_changes_no_bit(case, draws):
     order = draws.draw(st.permutations(range(len(case.X))))
     one, other = case.fitted(), case.fitted(case.X[order], case.Y[order])
@@ -76,8 +75,7 @@ def repetitions(draw, n_rows):
     return weights, np.repeat(np.arange(n_rows), weights)
 
 
-@fewer(2)
-@given(learned_cases(given_maps=STATELESS), st.data())
+@given(learned_cases(most_outputs=2, given_maps=STATELESS), st.data())
 def test_weight_is_so_many_rows_to_the_bit(case, draws):
     weights, rows = draws.draw(repetitions(len(case.X)))
     weighted, repeated = case.fitted(sample_weight=weights), case.fitted(case.X[rows], case.Y[rows])
