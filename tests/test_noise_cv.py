@@ -296,3 +296,17 @@ def test_signal_falls_if_it_does_not_hold_for_other_groups(seed):
     m = EVGPRegressor(n_inducing=60, random_state=0).fit(X, y, groups=groups)
     assert m.kernel_.k1.constant_value < 0.5 * alone.kernel_.k1.constant_value
     assert m.noise_variance_ > alone.noise_variance_
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_gaussian_process_that_no_other_group_confirms_warns(apart):
+    """Groups far apart say nothing about each other, though the Gaussian process explains the rows of each."""
+    rng, groups = np.random.RandomState(0), np.repeat(np.arange(6), 15)
+    t = np.tile(np.linspace(0.0, 3.0, 15), 6)
+    own = (rng.randn(6) + np.sin(2.0 * t.reshape(6, 15).T + rng.uniform(0.0, 6.0, 6))).T.ravel()
+    X, y = (20.0 * groups + t, own) if apart else (t, np.sin(2.0 * t))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fitted(groups, X[:, np.newaxis], y + 0.05 * rng.randn(90), feature_map=None, n_inducing=30)
+    said = [str(one.message) for one in caught]
+    assert any("does not improve predictions of left-out groups for 1 of 1 outputs" in one for one in said) == apart
