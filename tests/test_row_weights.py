@@ -241,3 +241,16 @@ def test_row_that_is_known_exactly_leaves_what_the_others_say():
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # y is not far from its prior mean
         model.fit(X[:20], y[:20], relative_variance=np.r_[1e-14, np.ones(19)])
+
+
+@pytest.mark.parametrize("as_dask", [True, False])
+def test_removed_rows_do_not_lift_the_smallest_variance_that_counts(as_dask):
+    import dask.array as da
+
+    variance = np.r_[np.full(22, 1e14), np.full(18, 2.0), 1.0][1:]
+    given = {"sample_weight": (variance < 10.0).astype(float), "relative_variance": variance}
+    given = {name: da.from_array(each, 10) if as_dask else each for name, each in given.items()}
+    rows = (da.from_array(X, (10, 2)), da.from_array(Y[:, 0], 10)) if as_dask else (X, Y[:, 0])
+    removed = evgp(inducing_init=X[30:]).fit(*rows, **given)
+    expected = evgp(inducing_init=X[30:]).fit(X[21:], Y[21:, 0], relative_variance=variance[21:])
+    np.testing.assert_allclose(removed.predict(X_NEW), expected.predict(X_NEW), rtol=1e-6, atol=1e-6)

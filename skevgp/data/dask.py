@@ -17,7 +17,7 @@ from .blocks import AnyBlock, Blocks, LinearSums
 from .maps import EXAMPLE_ROWS, MappedRows, Maps, evenly_spaced, fit_map, fresh_map
 from .rows import LocalSource, RawRows
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
-from .weights import SMALLEST_OF_MEDIAN, Chosen, check_variances, check_weights
+from .weights import Chosen, check_variances, check_weights, smallest_variance
 
 # A worker adds the sums of this many partitions at a time.
 _SUMMED_AT_ONCE = 8
@@ -92,6 +92,8 @@ class RowWeights:
     variance: list[Any] | None = None
     # (n_chunks,): number of rows of positive weight in each chunk. None: all rows.
     kept: np.ndarray | None = None
+    # The smallest relative noise variance that counts, the same for all chunks.
+    smallest: float = 0.0
 
     @classmethod
     def of(cls, X: Any, counts: Any, variance: Any) -> RowWeights:
@@ -100,15 +102,19 @@ class RowWeights:
         kept = None
         for chunks, check in ((counts, check_weights), (variance, check_variances)):
             if chunks is not None:
-                found = _dask().compute(*map(_dask().delayed(_range), chunks))
-                lowest, median, highest, positive = np.array(found).T
-                check(float(lowest.min()), float(highest.max()))
-                if chunks is counts:
-                    kept = positive.astype(int)
-                else:
-                    smallest = SMALLEST_OF_MEDIAN * float(np.median(median))
-                    variance = [_dask().delayed(np.maximum)(chunk, smallest) for chunk in chunks]
-        return cls(counts, variance, kept)
+                lowest, highest, positive = zip(*_dask().compute(*map(_dask().delayed(_range), chunks)), strict=True)
+                check(float(np.min(lowest)), float(np.max(highest)))
+                kept = np.array(positive) if chunks is counts else kept
+        smallest = 0.0
+        if variance is not None:
+            of_chunk, pairs = (
+                _dask().delayed(smallest_variance),
+                zip(variance, counts or [None] * len(variance), strict=True),
+            )
+            found = np.array(_dask().compute(*(of_chunk(*pair) for pair in pairs)))
+            # Chunks without a row of positive weight have none.
+            smallest = float(np.median(found[found > 0.0])) if found.any() else 0.0
+        return cls(counts, variance, kept, smallest)
 
     def labels_of(self, labels: np.ndarray) -> np.ndarray:
         """The labels of the rows of positive weight, from those of all rows (n,)."""
@@ -142,7 +148,11 @@ class DaskSource:
         chunks = zip(*given, weights.counts or none, weights.variance or none, strict=True)
         # Each partition is a `LocalSource` on a worker.
         self._partitions: Sequence[Any] = _held(
-            [partition(*chunk, shared_maps) for chunk, n in zip(chunks, lengths, strict=True) if n > 0]
+            [
+                partition(*chunk, shared_maps, weights.smallest)
+                for chunk, n in zip(chunks, lengths, strict=True)
+                if n > 0
+            ]
         )
         self._ends: np.ndarray = np.cumsum(lengths[lengths > 0])
         self.n_rows = int(lengths.sum())
@@ -234,7 +244,12 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
 
 
 def _partition(
-    X: np.ndarray, y: np.ndarray, counts: np.ndarray | None, variance: np.ndarray | None, maps: Maps
+    X: np.ndarray,
+    y: np.ndarray,
+    counts: np.ndarray | None,
+    variance: np.ndarray | None,
+    maps: Maps,
+    smallest: float,
 ) -> LocalSource:
     # Partitions are processed at the same time, and transformers need not be safe for that.
     maps = deepcopy(maps)
@@ -242,13 +257,13 @@ def _partition(
     y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y").reshape(len(X), -1)
     check_magnitude(X, "X")
     check_magnitude(y, "y")
-    chosen = Chosen.of(X, y, counts, variance, ordered=False)
+    chosen = Chosen.of(X, y, counts, variance, ordered=False, smallest=smallest)
     return LocalSource(MappedRows(X, X, y, maps, chosen), chosen.n_rows)
 
 
-def _range(values: np.ndarray) -> tuple[float, float, float, int]:
+def _range(values: np.ndarray) -> tuple[float, float, int]:
     values = as_floats(values, "sample_weight or relative_variance")
-    return float(values.min()), float(np.median(values)), float(values.max()), int(np.count_nonzero(values))
+    return float(values.min()), float(values.max()), int(np.count_nonzero(values))
 
 
 def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:

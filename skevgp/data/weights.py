@@ -14,7 +14,7 @@ from ..utils.validation import LARGEST, as_floats, is_dask, is_frame
 ORDERED_ROWS = 10_000
 _SMALLEST_VARIANCE = 1.0 / LARGEST
 # No noise variance is smaller than so much of the median: float64 would lose the other rows in the sums over rows.
-SMALLEST_OF_MEDIAN = 1e-10
+_SMALLEST_OF_MEDIAN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,13 @@ class Chosen:
         relative_variance: Any = None,
         groups: np.ndarray | None = None,
         ordered: bool = True,
+        smallest: float | None = None,
     ) -> Chosen:
         """Choose the rows of X, an array or a data frame, with positive weight.
 
         If ``ordered`` and there are at most `ORDERED_ROWS` rows, they are sorted, and equal rows of the same group
         (n_samples,) are merged. Then a fit does not depend on the order of the rows, and a weight of 2 is the same as
-        the row twice.
+        the row twice. A relative variance below ``smallest`` (None: `smallest_variance` of these rows) counts as that.
         """
         n = len(y)
         counts, variance = (
@@ -65,7 +66,7 @@ class Chosen:
             check_weights(float(counts.min()), float(counts.max()))
         if variance is not None:
             check_variances(float(variance.min()), float(variance.max()))
-            variance = np.maximum(variance, SMALLEST_OF_MEDIAN * np.median(variance))
+            variance = np.maximum(variance, smallest_variance(variance, counts) if smallest is None else smallest)
         positions, merged_into, unmerged = np.arange(n) if counts is None else np.flatnonzero(counts), None, None
         if ordered and len(positions) <= ORDERED_ROWS:
             order, starts = _sorted(X, y, positions, variance, groups)
@@ -161,6 +162,12 @@ def check_variances(lowest: float, highest: float) -> None:
             f"relative_variance must be positive, from {_SMALLEST_VARIANCE:g} to {LARGEST:g}; its entries range from "
             f"{lowest:g} to {highest:g}."
         )
+
+
+def smallest_variance(variance: np.ndarray, counts: np.ndarray | None) -> float:
+    """The smallest relative noise variance that float64 can represent next to those of the rows of positive weight."""
+    used = variance if counts is None else variance[counts > 0.0]
+    return _SMALLEST_OF_MEDIAN * float(np.median(used)) if len(used) else 0.0
 
 
 def _numbers(values: Any, name: str, n_samples: int) -> np.ndarray | None:

@@ -268,8 +268,8 @@ class EVGPRegressor(GaussianProcess):
             whole groups, so that ``std`` is valid for new trajectories. If None, rows are independent.
         relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
             Known noise variance of each row in units of σ², the same for all outputs. With ``WhiteKernel(1, "fixed")``
-            in the kernel, it is the ``alpha`` of GaussianProcessRegressor. Less than 1e-10 of the median counts as
-            1e-10 of it, because float64 would lose the other rows.
+            in the kernel, it is the ``alpha`` of GaussianProcessRegressor. The smallest that counts is 1e-10 of the
+            median, because float64 would lose the other rows.
 
         Returns
         -------
