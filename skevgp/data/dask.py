@@ -107,11 +107,8 @@ class RowWeights:
                 kept = np.array(positive) if chunks is counts else kept
         smallest = 0.0
         if variance is not None:
-            of_chunk, pairs = (
-                _dask().delayed(smallest_variance),
-                zip(variance, counts or [None] * len(variance), strict=True),
-            )
-            found = np.array(_dask().compute(*(of_chunk(*pair) for pair in pairs)))
+            pairs = zip(variance, counts or [None] * len(variance), strict=True)
+            found = np.array(_dask().compute(*(_dask().delayed(smallest_variance)(*pair) for pair in pairs)))
             # Chunks without a row of positive weight have none.
             smallest = float(np.median(found[found > 0.0])) if found.any() else 0.0
         return cls(counts, variance, kept, smallest)
