@@ -219,7 +219,7 @@ class _Group:
         product = np.empty((o + o * k, size))
         product[:o], product[o:] = group.mean, group.root.reshape(o * k, size)
         product[:o, m:] += offset
-        return cls(group, product, group.mean[:, :m] @ group.whitening.L_inv)
+        return cls(group, product, group.whitening.times_inverse_transposed(group.mean[:, :m].T).T)
 
     def moments(self, inputs: np.ndarray, features: np.ndarray, return_variance: bool) -> _Moments:
         """Return mean and variance at mapped rows. Without a feature map, features are ignored."""
@@ -230,7 +230,7 @@ class _Group:
         if return_variance:
             group.whitening.solve(prepared, out=P[:m])
         else:
-            np.matmul(group.whitening.L_inv, group.whitening.covariance.cross(prepared), out=P[:m])
+            P[:m] = group.whitening.times_inverse(group.whitening.covariance.cross(prepared))
         if size > m:
             P[m:] = of_outputs(features, group.outputs).T
         if not return_variance:
@@ -254,7 +254,7 @@ class _Group:
             return mean.transpose(1, 0, 2), None
         P_bar = 2.0 * (group.root.transpose(0, 2, 1) @ found.deviation)  # (o, m + p, n)
         P_bar[:, :m] -= (2.0 * group.signal)[:, np.newaxis, np.newaxis] * found.P[:m]
-        U_bar = group.whitening.L_inv.T @ P_bar[:, :m]
+        U_bar = group.whitening.times_inverse_transposed(P_bar[:, :m])
         variance = U_bar.transpose(2, 0, 1) @ slopes.transpose(1, 0, 2)  # (n, o, d)
         at_row = covariance.diagonal_slopes(found.prepared)
         if np.ndim(at_row):

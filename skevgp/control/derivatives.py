@@ -51,7 +51,7 @@ def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
     for group, own in zip(predictor.groups, predictor.projected(rows.inputs, rows.features), strict=True):
         covariance, (by_inputs, by_features) = group.whitening.covariance, rows.of(group)
         slopes = chained(covariance.slopes(own.prepared).transpose(1, 0, 2), by_inputs)  # (n, m, D)
-        P = np.concatenate([group.whitening.L_inv @ slopes, by_features], axis=1)  # (n, m + p, D)
+        P = np.concatenate([group.whitening.times_inverse(slopes), by_features], axis=1)  # (n, m + p, D)
         V = P[:, : len(group.points)]
         left = covariance.mixed_slopes(own.prepared)
         if by_inputs is not None:

@@ -16,6 +16,7 @@ import numpy as np
 from ..data.rows import of_outputs, times_weights
 from ..kernels.waves import RandomFunctions, random_functions
 from ..maps import Map
+from ..model.mixture import unmixed
 from ..model.predictor import Predictor, PredictorGroup, Projected
 from ..utils.shapes import like_y
 from .derivatives import MappedRows, chained, mapped
@@ -103,7 +104,13 @@ class FunctionSamples(Sequence["SampledFunction"]):
         predictor = posterior.predictor
         self._posterior = posterior
         common = common_normals(predictor, n, rng)
-        self._groups = [_Waves.drawn(group, predictor, n, n_waves, common, rng) for group in predictor.groups]
+        self._groups: list[_Waves | _WavesOfDraws] = []
+        for group in predictor.groups:
+            draws = unmixed(group)
+            if len(draws) == 1:
+                self._groups.append(_Waves.drawn(group, predictor, n, n_waves, common, rng))
+            else:
+                self._groups.append(_WavesOfDraws.drawn(draws, predictor, n, n_waves, rng))
         self._n = n
 
     def __len__(self) -> int:
@@ -152,7 +159,7 @@ class FunctionSamples(Sequence["SampledFunction"]):
         return self._shaped(X, np.concatenate(values, axis=1)), found if X.ndim == 2 else found[:, 0]
 
     def _pieces(self, rows: np.ndarray) -> Iterator[np.ndarray]:
-        waves = sum(own.n_waves * own.group.points.shape[1] for own in self._groups)
+        waves = sum(own.n_waves * own.n_columns for own in self._groups)
         size = max(1, _NUMBERS_OF_WAVES // waves)
         return (rows[first : first + size] for first in range(0, len(rows), size))
 
@@ -228,7 +235,12 @@ class _Waves:
         """Number L of waves of all terms of the kernel."""
         return self.by_waves.shape[2]
 
-    def values(self, inputs: np.ndarray, features: np.ndarray, which: slice) -> np.ndarray:
+    @property
+    def n_columns(self) -> int:
+        """Number d of columns of the kernel's inputs."""
+        return self.group.points.shape[1]
+
+    def values(self, inputs: np.ndarray, features: np.ndarray, which: Any) -> np.ndarray:
         """Evaluate some of the functions at rows: (o, k, n)."""
         group = self.group
         own, features = of_outputs(inputs, group.outputs), of_outputs(features, group.outputs)
@@ -236,7 +248,7 @@ class _Waves:
         found = self.by_points[:, which] @ V + self.by_waves[:, which] @ self.waves.value(own)
         return found + self.by_features[:, which] @ features.T
 
-    def slopes(self, rows: MappedRows, which: slice) -> np.ndarray:
+    def slopes(self, rows: MappedRows, which: Any) -> np.ndarray:
         """Differentiate some of the functions with respect to X: (o, k, n, D)."""
         group, (by_inputs, by_features) = self.group, rows.of(self.group)
         own = of_outputs(rows.inputs, group.outputs)
@@ -249,6 +261,55 @@ class _Waves:
         found = chained(found.reshape(o * k, n, d).transpose(1, 0, 2), by_inputs)  # (n, o k, D)
         found = found + self.by_features[:, which].reshape(o * k, -1) @ by_features
         return found.transpose(1, 0, 2).reshape(o, k, n, -1)
+
+
+@dataclass(frozen=True)
+class _WavesOfDraws:
+    """k functions of one output of a mixture: each comes from one of the draws of kernel and noise."""
+
+    draw_of: np.ndarray  # (k,): the draw of each function, of which about equally many have each
+    draws: list[_Waves]
+
+    @classmethod
+    def drawn(
+        cls, groups: list[PredictorGroup], predictor: Predictor, k: int, n_waves: int, rng: np.random.RandomState
+    ) -> _WavesOfDraws:
+        """Draw k functions."""
+        draw_of = (rng.permutation(k) + rng.randint(len(groups))) % len(groups)
+        draws, none = [], np.empty((0, 1, 0))
+        for s, group in enumerate(groups):
+            draws.append(_Waves.drawn(group, predictor, int(np.sum(draw_of == s)), n_waves, none, rng))
+        return cls(draw_of, draws)
+
+    @property
+    def n_waves(self) -> int:
+        """Number L of waves of a draw."""
+        return self.draws[0].n_waves
+
+    @property
+    def n_columns(self) -> int:
+        """Number d of columns of the kernel's inputs."""
+        return self.draws[0].n_columns
+
+    def values(self, inputs: np.ndarray, features: np.ndarray, which: slice) -> np.ndarray:
+        """Evaluate some of the functions at rows: (1, k, n)."""
+        return self._gathered(which, lambda waves, own: waves.values(inputs, features, own))
+
+    def slopes(self, rows: MappedRows, which: slice) -> np.ndarray:
+        """Differentiate some of the functions with respect to X: (1, k, n, D)."""
+        return self._gathered(which, lambda waves, own: waves.slopes(rows, own))
+
+    def _gathered(self, which: slice, of_draw: Callable[[_Waves, Any], np.ndarray]) -> np.ndarray:
+        wanted, found = self.draw_of[which], {}
+        # The place of each function among those of its draw.
+        place = np.array([np.sum(self.draw_of[:i] == s) for i, s in enumerate(self.draw_of)], dtype=int)[which]
+        for s in np.unique(wanted):
+            found[s] = of_draw(self.draws[s], place[wanted == s])
+        first = next(iter(found.values()))
+        gathered = np.empty((1, len(wanted), *first.shape[2:]))
+        for s, values in found.items():
+            gathered[:, wanted == s] = values
+        return gathered
 
 
 # --- along a path: exact ---------------------------------------------------------------------------------------------

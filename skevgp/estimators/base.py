@@ -326,14 +326,15 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
             labels = np.array([*prior.labels, ""], dtype=object)
             self.coef_groups_ = labels[np.full(prior.scale.shape, -1) if prior.groups is None else prior.groups][first]
+        mode = fitted.at_mode.predictor()
         kernels = [
             spec.to_sklearn(
                 group.hyperparameters,
                 fitted.limits("hyperparameters", o),
-                float(predictor.signal[o]),
+                float(mode.signal[o]),
                 fitted.limits("signal", o),
             )
-            for o, group in enumerate(predictor.by_output)
+            for o, group in enumerate(mode.by_output)
         ]
         self.kernel_ = kernels[0] if self._n_outputs == 1 else kernels
 
@@ -354,7 +355,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
 
     def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
         """Warn about the end of the fit, and about parameters of the given kernel that ended at their bounds."""
-        predictor = self._posterior.predictor
+        predictor = self._fitted.at_mode.predictor()
         at_bounds = (
             []
             if self.max_iter == 0

@@ -392,7 +392,7 @@ class EGPRegressor(GaussianProcess):
             raise ValueError("Gradient can only be evaluated for theta!=None: give theta=kernel_.theta.")
         if theta is None:
             return self.log_marginal_likelihood_value_
-        predictor = self._posterior.predictor
+        predictor = self._fitted.at_mode.predictor()
         if predictor.shared:
             raise ValueError("log_marginal_likelihood(theta) does not support weights that outputs share.")
         order, given, width = self._spec.order, self._spec.given_order, np.shape(theta)[-1:]
@@ -420,7 +420,7 @@ class EGPRegressor(GaussianProcess):
         ``numbers`` (n_hyper + 2,) are the hyperparameters of k̃, s² and σ², in the user's units. So is the value, in
         nats.
         """
-        posterior, target_unit = self._fitted.models[0].posterior, self._fitted.units.target_unit
+        posterior, target_unit = self._fitted.at_mode.models[0].posterior, self._fitted.units.target_unit
         assert isinstance(posterior, ExactPosterior)
         exact, only, variance = posterior.exact, slice(output, output + 1), target_unit[output] ** 2
         kernel = exact.kernel if exact.kernels is None else exact.kernels[output]
@@ -446,6 +446,7 @@ Optimizer = Callable[..., tuple[np.ndarray, float]]
 class UserOptimizer(Solver):
     """A function of the user as a solver of the exact model. It sees logarithms in the user's units."""
 
+    takes_prior = False
     takes_widest_limits = True
 
     def __init__(self, optimizer: Optimizer, target_unit: np.ndarray, n_restarts: int = 0):

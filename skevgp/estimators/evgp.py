@@ -486,6 +486,7 @@ class EVGPRegressor(GaussianProcess):
             noise_cv=None
             if folds is None
             else CrossValidation(folds, problem.groups, problem.spec.starts.signal.bounds is None),
+            averages=noise.inputs is None,
             n_threads=effective_n_jobs(self.n_jobs),
         )
         problem.check()
@@ -507,7 +508,7 @@ class EVGPRegressor(GaussianProcess):
             raise ValueError(f"inputs of Gaussian noise needs numbers in X without missing values.{which}") from error
 
     def _set_attributes(self, fitted: Fitted, data: Dataset) -> None:
-        points = [group.points for group in self._posterior.predictor.by_output]
+        points = [group.points for group in fitted.at_mode.predictor().by_output]
         same = len({len(own) for own in points}) == 1
         self.inducing_points_: Any = np.array(points) if same else points
         if sum(len(one.values["inducing_points"]) for one in fitted.models) == 1:

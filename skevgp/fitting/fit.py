@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..data.threads import BlockMap, side_by_side
+from ..model.mixture import MixturePosterior
 from ..model.parameters import Values, log_prior
-from ..model.posterior import LocalPosterior, SparsePosterior
+from ..model.posterior import FittedPosterior, LocalPosterior, SparsePosterior
 from ..model.statistics import SufficientStatistics
 from ..utils.monitor import Monitor
 from .calibration import Calibration, calibrate
@@ -95,7 +96,7 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     messages, calibration, statistics = [fit.message, model.far_from_prior(fit.values)], None, None
     if model.max_iter > 0 and not model.monitor.stopped:
         messages.append(model.learned_too_little(values))
-        if model.problem.noise_cv is not None:
+        if model.problem.noise_cv is not None and (model.hyper_prior is None or model.problem.groups is not None):
             statistics = model.sparse.statistics(values, model.blocks)
             with model.monitor.keeping_the_best():
                 calibration = _calibration(model, values, statistics, model.problem.noise_cv, doubts)
@@ -113,8 +114,21 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     posterior = model.posterior(values, statistics)
     if fit.predictor is not None and not changed and isinstance(posterior, SparsePosterior):
         posterior = posterior.with_q(fit.predictor, fit.bound - log_prior(values))
+    posterior = _averaged(model, fit.values, posterior)
     message = " ".join(part for part in messages if part)
     return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
+
+
+def _averaged(model: Model, values: Values, posterior: FittedPosterior) -> FittedPosterior:
+    """The posterior averaged over draws of kernel and noise, if rows are few. ``values`` are those before calibration.
+
+    The draws' signal and noise are calibrated by the same factors as those of the mode.
+    """
+    if model.hyper_prior is None or not model.problem.averages or model.monitor.stopped:
+        return posterior
+    factors = {name: posterior.values[name] / values[name] for name in ("signal", "noise")}
+    draws = [draw | {name: draw[name] * by for name, by in factors.items()} for draw in model.draws(values)]
+    return MixturePosterior(posterior, tuple(map(model.posterior, draws))) if draws else posterior
 
 
 def _calibration(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..data.rows import Rows, Source
+from ..model.mixture import MixturePosterior
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values
 from ..model.posterior import FittedPosterior, LocalPosterior, SparsePosterior
@@ -104,6 +105,21 @@ class Fitted:
     def predictor(self) -> Predictor:
         """The predictor of all outputs, in the user's units."""
         return self.units.predictor([model.predictor for model in self.models], self.outputs)
+
+    @property
+    def at_mode(self) -> Fitted:
+        """The models with their most likely kernel and noise only, if predictions are averaged over draws of them."""
+        models = (
+            replace(model, posterior=model.posterior.mode) if isinstance(model.posterior, MixturePosterior) else model
+            for model in self.models
+        )
+        return replace(self, models=tuple(models))
+
+    @property
+    def n_draws(self) -> int:
+        """Number of draws of kernel and noise over which predictions are averaged. 0 if there is only one kernel."""
+        mixtures = (model.posterior for model in self.models if isinstance(model.posterior, MixturePosterior))
+        return max((len(mixture.draws) for mixture in mixtures), default=0)
 
     @property
     def outputs(self) -> list[list[int]]:

@@ -18,9 +18,11 @@ from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
 from ..model.posterior import ExactPosterior, FittedPosterior, SparsePosterior
 from ..model.statistics import SufficientStatistics
-from ..solvers.base import Minimum, Tolerance
+from ..solvers import LBFGS
+from ..solvers.base import Minimum, Objective, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
+from . import few_rows
 from .alone import best_by_likelihood, best_by_sums, features_alone, noise_left_over
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more_points
 from .messages import ended_early, far_from_prior, learned_too_little, mini_batches_ended
@@ -39,6 +41,8 @@ LEAST_TOL, ENOUGH = 0.01, 1.5e-5
 _FLAT, _FLAT_PER_ROW = 0.1, 0.005
 # Relative size of the rounding errors in a bound on all rows.
 _BOUND_ROUNDING = 1e-8
+# The mode of kernel and noise is found to so many nats, in up to so many iterations, before draws around it.
+_MODE_TOL, _MODE_ITER = 1e-6, 100
 # Length of the natural gradient steps of q: the first, and the smallest.
 _NATURAL_RATES = 0.3, 0.02
 
@@ -128,17 +132,65 @@ class Model:
         """Weights (o, p) with an infinite prior scale."""
         return self.problem.vague[self.rows.columns]
 
-    def objective(self, table: ParameterTable, n_rows: int | None = None) -> BoundObjective | LikelihoodObjective:
-        """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all."""
+    def objective(self, table: ParameterTable, n_rows: int | None = None) -> Objective:
+        """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all.
+
+        That of all rows has the log prior of kernel and noise, if these have one.
+        """
         if n_rows is not None:
             # A smaller sample is the first part of the larger one.
             blocks = self.sparse.blocks(self._sample.subset(np.arange(n_rows)), self.n_inducing)
             # It only gives a start. The bound of Titsias (2009) spreads points better: what they leave out costs more.
             loose = replace(self.sparse, variant=replace(self.sparse.variant, tight=False))
             return BoundObjective(loose, table, blocks)
-        if self.exact is not None:
-            return LikelihoodObjective(self.exact, table)
-        return BoundObjective(self.sparse, table, self.blocks)
+        objective: BoundObjective | LikelihoodObjective = (
+            BoundObjective(self.sparse, table, self.blocks)
+            if self.exact is None
+            else LikelihoodObjective(self.exact, table)
+        )
+        if self.hyper_prior is None:
+            return objective
+        return few_rows.WithPrior(objective, table, self.hyper_prior, self.rows.total)
+
+    @cached_property
+    def hyper_prior(self) -> few_rows.HyperPrior | None:
+        """The prior of kernel and noise. None if there are enough rows, or if there is no such prior for the model."""
+        problem, table, (o, _) = self.problem, self.table, self.sparse.prior.scale.shape
+        n_free = sum(table[name].free.sum() for name in ("hyperparameters", "signal", "noise"))
+        weight = 1.0 - o * self.rows.total / max(self.rules.few_rows * n_free, 1.0)
+        unsupported = (
+            not problem.solver.takes_prior
+            or problem.noise.heavy_tails
+            or problem.variant != replace(problem.variant, family="full", orthogonal=False, n_neighbors=0)
+            or self.sparse.kernels is not None
+            or self.sparse.prior.shared
+        )
+        if weight <= 0.0 or unsupported or self.max_iter == 0 or not table["hyperparameters"].free.any():
+            return None
+        if self.rows.is_constant().any():
+            return None
+        scale, scatter = self.rows.inputs.scale, self.scatter
+        return few_rows.HyperPrior.of(table, self.lengthscale_mask, scale, scatter, weight)
+
+    def log_hyper_prior(self, values: Values) -> float:
+        """The log prior density of kernel and noise, which the objective has."""
+        return 0.0 if self.hyper_prior is None else self.hyper_prior(values)[0]
+
+    def draws(self, values: Values) -> list[Values]:
+        """Draws of kernel and noise from their posterior, whose mode is near some values. Empty if it was stopped."""
+        table, n_rows = self.table.started_at(values).changed("inducing_points", fixed=True), self.rows.total
+        objective, limits, monitor = self.objective(table), table.limits(), self.monitor.silent()
+
+        def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
+            loss, gradient = objective(x)
+            return n_rows * loss, n_rows * gradient
+
+        curvature, tolerance = (objective, table.alike()), Tolerance(_MODE_TOL / n_rows)
+        mode = LBFGS().minimise(objective, table.start(), limits, _MODE_ITER, tolerance, monitor, curvature).x
+        found: list[np.ndarray] = []
+        with monitor.keeping_the_best():
+            found = few_rows.drawn(energy, mode, limits, np.random.RandomState(0), partial(monitor.iteration, 0))
+        return [table.values(x) for x in found]
 
     def bound_at(self, values: Values, n_rows: int | None = None) -> float:
         """The bound at some values, of a sample of ``n_rows`` rows or of all. -inf if it cannot be computed."""

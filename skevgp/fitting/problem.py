@@ -76,6 +76,8 @@ class Problem:
     # (n, o): noise variances of the rows in units of σ², on top of those in the source. The outputs of a model share
     # their mean.
     row_variance: np.ndarray | None = None
+    # Whether predictions are averaged over draws of kernel and noise if rows are few (see `few_rows`).
+    averages: bool = True
     # For independent models, or else for blocks of rows.
     n_threads: int = 1
 

@@ -63,6 +63,9 @@ class Rules:
     # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
     # first ones. A small sample may not show that a column matters.
     longest: float = 3.0
+    # With fewer rows than this for each free number of kernel, signal and noise, these have a prior, whose weight falls
+    # from 1 to 0 at so many rows, and predictions are averaged over draws of them (see `few_rows`). 0: never.
+    few_rows: float = 0.0
     # A restart multiplies the first values by random numbers between 1 / factor and the factor, log-uniformly.
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
@@ -86,6 +89,7 @@ RULES = Rules(
     much_noise=1e3,
     stage=25,
     sample=(1000, 20),
+    few_rows=12.0,
 )
 MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 

@@ -172,10 +172,14 @@ class Search:
             return True
         return self._below(fit)
 
+    def _bound(self, fit: Fit) -> float:
+        """The bound of a fit without the prior of kernel and noise, which the features alone do not have."""
+        return fit.bound - self.model.log_hyper_prior(fit.values)
+
     def _below(self, fit: Fit, hopeless: bool = False) -> bool:
         """Whether a fit ended below the features alone. One that has not ended may still rise, unless ``hopeless``."""
         ended = hopeless or fit.converged or fit.n_iter < self.max_iter
-        return fit.n_rows is None and ended and fit.bound < self.model.alone.bound - _WORTH
+        return fit.n_rows is None and ended and self._bound(fit) < self.model.alone.bound - _WORTH
 
     def _is_doubtful(self, best: Fit) -> bool:
         """Whether the best fit is, or may be, below the features alone, and another start could help."""
@@ -183,7 +187,7 @@ class Search:
         if self.max_iter == 0 or not free or not self.rules.last_start:
             return False
         alone = self.model.alone
-        maybe_below = best.n_rows is None and best.bound < alone.most - _WORTH
+        maybe_below = best.n_rows is None and self._bound(best) < alone.most - _WORTH
         return maybe_below or self._below(best, hopeless=alone.hidden)
 
 

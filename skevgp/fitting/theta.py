@@ -471,7 +471,8 @@ def calibrate(
             f"A feature map with parameters ({', '.join(theta.names)}) needs {solvers_of_all_rows()} with "
             f'posterior="full", and Gaussian noise of y only; got solver={solver!r} and noise={noise!r}.'
         )
-    calibrator = _Calibrator(data, problem, theta)
+    # θ has one posterior, given one kernel.
+    calibrator = _Calibrator(data, replace(problem, averages=False), theta)
     fitted, before = previous
     seed, goes_on = rng.randint(np.iinfo(np.int32).max), False
     if before is not None and before.theta.names == theta.names:

@@ -153,7 +153,8 @@ class SparsePosterior:
         sparse, before = replace(self.sparse, complete=False), self.statistics
         whitenings = self.known_whitenings
         if whitenings is None:
-            whitenings = tuple(group.whitening for group in self.predictor.groups)
+            groups = self.predictor.groups
+            whitenings = tuple(group.whitening for group in groups if isinstance(group.whitening, Whitening))
         if weight < 1.0:
             # The tight charge of earlier rows with another weight is not known from their sums.
             before = sparse.with_loose_charge(self.values, before)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,7 +12,24 @@ from ..data.rows import Columns, of_outputs, times_weights
 from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
 from .conditioning import Conditioned, KnownRows
 from .parameters import Values
-from .statistics import Kernel, Whitening
+from .statistics import Kernel
+
+
+class AnyWhitening(Protocol):
+    """What predictions need of a `Whitening`, whose methods these are."""
+
+    @property
+    def covariance(self) -> Any: ...
+    @property
+    def L(self) -> np.ndarray: ...
+    @property
+    def L_inv(self) -> np.ndarray: ...
+    def times_inverse(self, U: np.ndarray) -> np.ndarray: ...
+    def times_inverse_transposed(self, U: np.ndarray) -> np.ndarray: ...
+    def solve(self, prepared: Any, out: np.ndarray) -> np.ndarray: ...
+    def remaining(self, prepared: Any, V: np.ndarray) -> np.ndarray: ...
+    def jitter(self) -> float: ...
+
 
 # Predictions of several rows at once take arrays of about this many numbers.
 _PREDICTED_NUMBERS = 2**20
@@ -107,7 +124,7 @@ class PredictorGroup:
     hyperparameters: np.ndarray
     # (m, d), and their whitening.
     points: np.ndarray
-    whitening: Whitening
+    whitening: AnyWhitening
     # (o,): s².
     signal: np.ndarray
     # (o, m + p).
@@ -128,7 +145,7 @@ class PredictorGroup:
         kernel: Kernel,
         hyperparameters: np.ndarray,
         points: np.ndarray,
-        whitening: Whitening,
+        whitening: AnyWhitening,
         signal: np.ndarray,
         prior: CoefficientPrior,
         mean: Sequence[np.ndarray],

@@ -64,6 +64,14 @@ class Whitening:
         added = np.einsum("ij,ij->i", self.L, self.L) - diagonal
         return np.where(added > _NO_JITTER * diagonal, added, 0.0), diagonal
 
+    def times_inverse(self, U: np.ndarray) -> np.ndarray:
+        """L⁻¹ U for U (..., m, n)."""
+        return self.L_inv @ U
+
+    def times_inverse_transposed(self, U: np.ndarray) -> np.ndarray:
+        """L⁻ᵀ U for U (..., m, n)."""
+        return self.L_inv.T @ U
+
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """U = k(X_m, X) and V = L⁻¹ U, both (m, n), for rows from `Kernel.prepare`. V is written to ``out``."""
         U = self.covariance.cross(prepared)
