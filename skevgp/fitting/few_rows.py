@@ -7,7 +7,7 @@ predictions are averaged over draws from the posterior of kernel and noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +22,18 @@ _LENGTH_MEAN, _LENGTH_STD = np.sqrt(2.0), np.sqrt(3.0)
 # Standard deviations of the logarithms of the signal variance, the noise variance and other hyperparameters. Their
 # median is their start, except that of the noise variance, which is this share of the residuals' variance.
 _SIGNAL_STD, _NOISE_STD, _OTHER_STD, _NOISE_SHARE = 2.0, 3.0, np.sqrt(3.0), 1e-2
-# Hamiltonian Monte Carlo: trajectories before the first draw, draws (one per trajectory), steps of a trajectory, and
-# the first length of a step in posterior standard deviations.
-_WARM_UP, N_DRAWS, _STEPS, _STEP = 12, 16, 8, 0.25
+# A start by forward selection: each column is long, this many times the median of the prior, or short, in standard
+# deviations of the column. The noise variance is this share of the residuals' variance. A column must gain so many
+# nats. At most so many are tried each time, and so many chosen.
+_LONG, _SHORT, _NOISE, _GAIN, _TRIED, _CHOSEN = 3.0, 1.0, 0.3, 1.0, 40, 8
+# Modes are different if a coordinate differs by more than this.
+_SAME = 0.2
+# Share of the difference between the log evidences of two modes that counts: it is only known from the curvature along
+# the axes.
+_EVIDENCE = 0.5
+# Hamiltonian Monte Carlo: draws, trajectories for each draw, trajectories before the first draw, steps of a
+# trajectory, and the first length of a step in posterior standard deviations.
+N_DRAWS, _PER_DRAW, _WARM_UP, _STEPS, _STEP = 16, 2, 12, 8, 0.3
 # The step length is changed towards this rate of acceptance during the warm-up.
 _ACCEPTED, _CHANGE = 0.8, 1.25
 # Positions are multiples of this many units, and units are powers of 2: rounding errors of one trajectory, which differ
@@ -43,6 +52,8 @@ class HyperPrior:
     # The means and standard deviations of the logarithms, in the parameters' shapes.
     means: Values
     stds: Values
+    # Which hyperparameters (n_hyper,) are the length scales of the columns. None: there is not one for each column.
+    columns: np.ndarray | None
 
     @classmethod
     def of(
@@ -57,13 +68,13 @@ class HyperPrior:
         means = {name: np.log(start) for name, start in starts.items()}
         spreads = {"hyperparameters": _OTHER_STD, "signal": _SIGNAL_STD, "noise": _NOISE_STD}
         length = _LENGTH_MEAN + 0.5 * np.log(d) + np.log(column_std)
-        if mask.sum() and mask.sum() % d == 0:
-            means["hyperparameters"][..., mask] = np.resize(length, mask.sum())
+        if mask.sum() == d and starts["hyperparameters"].ndim == 1:
+            means["hyperparameters"][mask] = length
         elif len(mask) == 1:
             means["hyperparameters"][...] = length.mean()
         means["noise"] = np.log(_NOISE_SHARE * scatter)
         stds = {name: np.full(start.shape, spreads[name]) for name, start in starts.items()}
-        return cls(weight, means, stds)
+        return cls(weight, means, stds, mask if mask.sum() == d else None)
 
     def __call__(self, values: Values) -> tuple[float, Values]:
         """The log density without its constant, and its gradient in the logarithms."""
@@ -87,43 +98,104 @@ class WithPrior:
         return loss - value / self.n_rows, slopes - self.table.gradient(gradient) / self.n_rows
 
 
+# --- a start ----------------------------------------------------------------------------------------------------------
+
+
+def forward_selection(energy: Objective, table: ParameterTable, prior: HyperPrior, scatter: np.ndarray) -> Values:
+    """Values in which a few columns have short length scales: one after another, the one that lowers the energy most.
+
+    With about as many columns as rows, a gradient leads to many columns that matter a little. ``energy`` is a function
+    of the flat vector of the table, and ``prior.columns`` is not None.
+    """
+    assert prior.columns is not None
+    values, place = table.values_at_start(), np.flatnonzero(prior.columns)
+    means = {name: np.exp(mean) for name, mean in prior.means.items()}
+    hyperparameters = np.where(prior.columns, _LONG * means["hyperparameters"], values["hyperparameters"])
+    short = _SHORT * means["hyperparameters"] / np.exp(_LENGTH_MEAN + 0.5 * np.log(len(place)))
+    values |= {"hyperparameters": hyperparameters, "signal": means["signal"], "noise": _NOISE * scatter}
+
+    def at(hyperparameters: np.ndarray) -> tuple[float, np.ndarray]:
+        start = table.started_at(values | {"hyperparameters": hyperparameters}).start()
+        value, slope = _at(energy, start)
+        return value, table.coordinates(slope)["hyperparameters"]
+
+    best, slope = at(hyperparameters)
+    chosen: list[int] = []
+    while len(chosen) < min(_CHOSEN, len(place)):
+        # The columns that would gain most from a little shorter length scale.
+        left = [j for j in place[np.argsort(-slope[place], kind="stable")].tolist() if j not in chosen][:_TRIED]
+        tried = [np.where(np.arange(len(short)) == j, short, hyperparameters) for j in left]
+        found = [at(one) for one in tried]
+        index = int(np.argmin([value for value, _ in found]))
+        if not found[index][0] < best - _GAIN:
+            break
+        best, slope = found[index]
+        hyperparameters = tried[index]
+        chosen.append(left[index])
+    return values | {"hyperparameters": hyperparameters}
+
+
 # --- draws ------------------------------------------------------------------------------------------------------------
 
 
 def drawn(
     energy: Objective,
-    mode: np.ndarray,
+    modes: Sequence[np.ndarray],
     limits: tuple[np.ndarray, np.ndarray],
     rng: np.random.RandomState,
     seen: Callable[[float], None],
 ) -> list[np.ndarray]:
-    """Draws from the density exp(-energy(x)), whose mode is x (size,): a chain of Hamiltonian Monte Carlo (Neal 2011).
+    """`N_DRAWS` draws from the density exp(-energy(x)), given some of its modes (size,).
 
-    ``energy`` returns its value and gradient. ``limits`` reflect the chain. ``seen`` is called with the energy after
+    ``energy`` returns its value and gradient. ``limits`` reflect the chains. ``seen`` is called with the energy after
     each trajectory.
     """
-    unit = _units(energy, np.round(mode / _START_GRID) * _START_GRID, rng)
+    # Each mode has draws by its share of the evidence, ∫ exp(-energy) ≈ exp(-energy) Π unit around it.
+    different: list[np.ndarray] = []
+    for mode in modes:
+        if all(np.abs(mode - other).max(initial=0.0) > _SAME for other in different):
+            different.append(mode)
+    units = [_units(energy, np.round(mode / _START_GRID) * _START_GRID, rng) for mode in different]
+    sizes = [np.log(unit).sum() - _at(energy, mode)[0] for mode, unit in zip(different, units, strict=True)]
+    shares = np.exp(_EVIDENCE * (np.array(sizes) - max(sizes)))
+    ends = np.round(N_DRAWS * np.cumsum(shares) / shares.sum()).astype(int)
+    draws: list[np.ndarray] = []
+    for mode, unit, n_draws in zip(different, units, np.diff(ends, prepend=0), strict=True):
+        if n_draws:
+            draws += _chain(energy, mode, unit, limits, n_draws, rng, seen)
+    return draws
+
+
+def _chain(
+    energy: Objective,
+    mode: np.ndarray,
+    unit: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray],
+    n_draws: int,
+    rng: np.random.RandomState,
+    seen: Callable[[float], None],
+) -> list[np.ndarray]:
+    """Draws by Hamiltonian Monte Carlo (Neal 2011) from a mode, with momenta in units of the coordinates."""
     x = _on_grid(np.clip(mode, *limits), unit)
-    (here, slope), step, draws = _at(energy, x), _STEP, []
-    for turn in range(_WARM_UP + N_DRAWS):
+    (here, slope), step, draws = _at(energy, x), _STEP, list[np.ndarray]()
+    for turn in range(_WARM_UP + _PER_DRAW * n_draws):
         momentum, uniform, length = rng.standard_normal(len(x)), rng.uniform(), rng.uniform(0.8, 1.2)
-        there, p, total = x, momentum, np.inf
-        slope_there = slope
+        kick = step * length * unit
+        there, p, total, slope_there = x, momentum, here, slope
         for _ in range(_STEPS):
-            p = p - 0.5 * step * length * unit * slope_there
-            there, p = _reflected(_on_grid(there + step * length * unit * p, unit), p, limits)
+            p = p - 0.5 * kick * slope_there
+            there, p = _reflected(_on_grid(there + kick * p, unit), p, limits)
             total, slope_there = _at(energy, there)
             if not np.isfinite(total):
                 break
-            p = p - 0.5 * step * length * unit * slope_there
+            p = p - 0.5 * kick * slope_there
         change = here - total + 0.5 * (momentum @ momentum - p @ p) if np.isfinite(total) else -np.inf
         accepted = np.exp(min(change, 0.0))
         if uniform < accepted:
             x, here, slope = there, total, slope_there
         if turn < _WARM_UP:
-            step *= _CHANGE if accepted > _ACCEPTED else 1.0 / _CHANGE
-            step = min(step, _STEP)
-        else:
+            step = min(step * (_CHANGE if accepted > _ACCEPTED else 1.0 / _CHANGE), _STEP)
+        elif (turn - _WARM_UP) % _PER_DRAW == _PER_DRAW - 1:
             draws.append(x)
         seen(here)
     return draws

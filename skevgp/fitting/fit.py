@@ -114,20 +114,20 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     posterior = model.posterior(values, statistics)
     if fit.predictor is not None and not changed and isinstance(posterior, SparsePosterior):
         posterior = posterior.with_q(fit.predictor, fit.bound - log_prior(values))
-    posterior = _averaged(model, fit.values, posterior)
+    posterior = _averaged(model, fit, posterior)
     message = " ".join(part for part in messages if part)
     return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
 
 
-def _averaged(model: Model, values: Values, posterior: FittedPosterior) -> FittedPosterior:
-    """The posterior averaged over draws of kernel and noise, if rows are few. ``values`` are those before calibration.
+def _averaged(model: Model, fit: Fit, posterior: FittedPosterior) -> FittedPosterior:
+    """The posterior averaged over draws of kernel and noise, if rows are few.
 
     The draws' signal and noise are calibrated by the same factors as those of the mode.
     """
     if model.hyper_prior is None or not model.problem.averages or model.monitor.stopped:
         return posterior
-    factors = {name: posterior.values[name] / values[name] for name in ("signal", "noise")}
-    draws = [draw | {name: draw[name] * by for name, by in factors.items()} for draw in model.draws(values)]
+    factors = {name: posterior.values[name] / fit.values[name] for name in ("signal", "noise")}
+    draws = [draw | {name: draw[name] * by for name, by in factors.items()} for draw in model.draws(fit)]
     return MixturePosterior(posterior, tuple(map(model.posterior, draws))) if draws else posterior
 
 

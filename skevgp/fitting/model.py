@@ -155,9 +155,9 @@ class Model:
     @cached_property
     def hyper_prior(self) -> few_rows.HyperPrior | None:
         """The prior of kernel and noise. None if there are enough rows, or if there is no such prior for the model."""
-        problem, table, (o, _) = self.problem, self.table, self.sparse.prior.scale.shape
+        problem, table = self.problem, self.table
         n_free = sum(table[name].free.sum() for name in ("hyperparameters", "signal", "noise"))
-        weight = 1.0 - o * self.rows.total / max(self.rules.few_rows * n_free, 1.0)
+        weight = 1.0 - self.rows.total / max(self.rules.few_rows * n_free, 1.0)
         unsupported = (
             not problem.solver.takes_prior
             or problem.noise.heavy_tails
@@ -176,21 +176,38 @@ class Model:
         """The log prior density of kernel and noise, which the objective has."""
         return 0.0 if self.hyper_prior is None else self.hyper_prior(values)[0]
 
-    def draws(self, values: Values) -> list[Values]:
-        """Draws of kernel and noise from their posterior, whose mode is near some values. Empty if it was stopped."""
-        table, n_rows = self.table.started_at(values).changed("inducing_points", fixed=True), self.rows.total
-        objective, limits, monitor = self.objective(table), table.limits(), self.monitor.silent()
+    def by_forward_selection(self) -> Values | None:
+        """The start of `few_rows.forward_selection`. None if rows are not few, or if there are not several columns."""
+        prior = self.hyper_prior
+        if prior is None or prior.columns is None or prior.columns.sum() < 2:
+            return None
+        table = self.table.changed("inducing_points", fixed=True)
+        chosen = few_rows.forward_selection(self._energy(table), table, prior, self.scatter)
+        return {name: chosen[name] for name in prior.means}
+
+    def draws(self, fit: Fit) -> list[Values]:
+        """Draws of kernel and noise from their posterior around the ends of a search. Empty if it was stopped."""
+        table, monitor = self.table.started_at(fit.values).changed("inducing_points", fixed=True), self.monitor.silent()
+        objective, limits, tolerance = self.objective(table), table.limits(), Tolerance(_MODE_TOL / self.rows.total)
+        modes: list[np.ndarray] = []
+        for values in (fit.values, *fit.others):
+            start, curvature = np.clip(table.started_at(values).start(), *limits), (objective, table.alike())
+            modes.append(LBFGS().minimise(objective, start, limits, _MODE_ITER, tolerance, monitor, curvature).x)
+        found: list[np.ndarray] = []
+        with monitor.keeping_the_best():
+            rng, seen = np.random.RandomState(0), partial(monitor.iteration, 0)
+            found = few_rows.drawn(self._energy(table), modes, limits, rng, seen)
+        return [table.values(x) for x in found]
+
+    def _energy(self, table: ParameterTable) -> Objective:
+        """Minus the bound and the log prior, in nats, and its gradient."""
+        objective, n_rows = self.objective(table), self.rows.total
 
         def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
             loss, gradient = objective(x)
             return n_rows * loss, n_rows * gradient
 
-        curvature, tolerance = (objective, table.alike()), Tolerance(_MODE_TOL / n_rows)
-        mode = LBFGS().minimise(objective, table.start(), limits, _MODE_ITER, tolerance, monitor, curvature).x
-        found: list[np.ndarray] = []
-        with monitor.keeping_the_best():
-            found = few_rows.drawn(energy, mode, limits, np.random.RandomState(0), partial(monitor.iteration, 0))
-        return [table.values(x) for x in found]
+        return energy
 
     def bound_at(self, values: Values, n_rows: int | None = None) -> float:
         """The bound at some values, of a sample of ``n_rows`` rows or of all. -inf if it cannot be computed."""

@@ -26,6 +26,8 @@ class Fit:
     predictor: Predictor | None = None
     # Size of the sample that was fitted. None: all rows.
     n_rows: int | None = None
+    # The ends of other starts on all rows, if rows are few.
+    others: tuple[Values, ...] = ()
     # Names of the parameters that had their widest limits.
     widened: tuple[str, ...] = ()
 

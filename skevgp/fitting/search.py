@@ -37,7 +37,7 @@ def search(model: Model) -> Fit:
         fits.run()
     if fits.best is None:
         raise KeyboardInterrupt
-    return fits.best
+    return replace(fits.best, others=tuple(fits.ends))
 
 
 class Search:
@@ -46,6 +46,8 @@ class Search:
     def __init__(self, model: Model):
         self.model, self.rules, self.table, self.max_iter = model, model.rules, model.table, model.max_iter
         self.best: Fit | None = None
+        # The ends of starts on all rows.
+        self.ends: list[Values] = []
 
     def run(self) -> None:
         """Fit from one start after another. If the start from an earlier fit fails, cold starts follow."""
@@ -151,6 +153,12 @@ class Search:
         free, everything = bool(self.table["noise"].free.any()), n_rows is None
         much = self.rules.much_noise if free and (self.model.interpolates or not everything) else None
         best = self._fit(Start(values, until, None, n_rows, cold=True))
+        selected = self.model.by_forward_selection()
+        if everything and until > 0 and selected is not None:
+            self.ends.append(best.values)
+            fit = self._fit(Start(values | selected, until, None, cold=True))
+            self.ends.append(fit.values)
+            best, much = better(best, fit), None
         if until == 0 or not free:
             return best
         starts = list(self.rules.other_starts)
