@@ -18,10 +18,10 @@ from ..utils.linalg import NotPositiveDefiniteError
 
 # The prior of a length scale: log(length scale / std of the column) ~ N(√2 + ½ log d, 3) for d columns (Hvarfner,
 # Hellsten & Nardi 2024, "Vanilla Bayesian Optimization Performs Great in High Dimensions", eq. 9).
-_LENGTH_MEAN, _LENGTH_STD = np.sqrt(2.0), np.sqrt(3.0)
+_LENGTH_MEAN, _LENGTH_STD = 2.3, 1.4
 # Standard deviations of the logarithms of the signal variance, the noise variance and other hyperparameters. Their
 # median is their start, except that of the noise variance, which is this share of the residuals' variance.
-_SIGNAL_STD, _NOISE_STD, _OTHER_STD, _NOISE_SHARE = 2.0, 3.0, np.sqrt(3.0), 1e-2
+_SIGNAL_STD, _NOISE_STD, _OTHER_STD, _NOISE_SHARE = 4.0, 2.0, 2.0, 0.1
 # A start by forward selection: each column is long, this many times the median of the prior, or short, in standard
 # deviations of the column. The noise variance is this share of the residuals' variance. A column must gain so many
 # nats. At most so many are tried each time, and so many chosen.
@@ -33,7 +33,7 @@ _SAME = 0.2
 _EVIDENCE = 0.5
 # Hamiltonian Monte Carlo: draws, trajectories for each draw, trajectories before the first draw, steps of a
 # trajectory, and the first length of a step in posterior standard deviations.
-N_DRAWS, _PER_DRAW, _WARM_UP, _STEPS, _STEP = 16, 2, 12, 8, 0.3
+N_DRAWS, _PER_DRAW, _WARM_UP, _STEPS, _STEP = 16, 2, 10, 8, 0.3
 # The step length is changed towards this rate of acceptance during the warm-up.
 _ACCEPTED, _CHANGE = 0.8, 1.25
 # Positions are multiples of this many units, and units are powers of 2: rounding errors of one trajectory, which differ
@@ -65,16 +65,16 @@ class HyperPrior:
         ``column_std`` (d,). ``scatter`` (o,) is the variance of the residuals.
         """
         d, starts = len(column_std), {name: table[name].start for name in ("hyperparameters", "signal", "noise")}
-        means = {name: np.log(start) for name, start in starts.items()}
+        means = {name: np.log(start) for name, start in starts.items()} | {"noise": np.log(_NOISE_SHARE * scatter)}
         spreads = {"hyperparameters": _OTHER_STD, "signal": _SIGNAL_STD, "noise": _NOISE_STD}
-        length = _LENGTH_MEAN + 0.5 * np.log(d) + np.log(column_std)
-        if mask.sum() == d and starts["hyperparameters"].ndim == 1:
-            means["hyperparameters"][mask] = length
-        elif len(mask) == 1:
-            means["hyperparameters"][...] = length.mean()
-        means["noise"] = np.log(_NOISE_SHARE * scatter)
         stds = {name: np.full(start.shape, spreads[name]) for name, start in starts.items()}
-        return cls(weight, means, stds, mask if mask.sum() == d else None)
+        length = _LENGTH_MEAN + 0.5 * np.log(d) + np.log(column_std)
+        columns = mask if mask.sum() == d and starts["hyperparameters"].ndim == 1 else None
+        if columns is not None:
+            means["hyperparameters"][columns], stds["hyperparameters"][columns] = length, _LENGTH_STD
+        elif len(mask) == 1:
+            means["hyperparameters"][...], stds["hyperparameters"][...] = length.mean(), _LENGTH_STD
+        return cls(weight, means, stds, columns)
 
     def __call__(self, values: Values) -> tuple[float, Values]:
         """The log density without its constant, and its gradient in the logarithms."""
@@ -179,7 +179,7 @@ def _chain(
     x = _on_grid(np.clip(mode, *limits), unit)
     (here, slope), step, draws = _at(energy, x), _STEP, list[np.ndarray]()
     for turn in range(_WARM_UP + _PER_DRAW * n_draws):
-        momentum, uniform, length = rng.standard_normal(len(x)), rng.uniform(), rng.uniform(0.8, 1.2)
+        momentum, uniform, length = rng.standard_normal(len(x)), rng.uniform(), rng.uniform(0.4, 1.2)
         kick = step * length * unit
         there, p, total, slope_there = x, momentum, here, slope
         for _ in range(_STEPS):

@@ -190,7 +190,7 @@ class Model:
         table, monitor = self.table.started_at(fit.values).changed("inducing_points", fixed=True), self.monitor.silent()
         objective, limits, tolerance = self.objective(table), table.limits(), Tolerance(_MODE_TOL / self.rows.total)
         modes: list[np.ndarray] = []
-        for values in (fit.values, *fit.others):
+        for values in fit.others or (fit.values,):
             start, curvature = np.clip(table.started_at(values).start(), *limits), (objective, table.alike())
             modes.append(LBFGS().minimise(objective, start, limits, _MODE_ITER, tolerance, monitor, curvature).x)
         found: list[np.ndarray] = []

@@ -76,6 +76,8 @@ class Search:
         """Run the solver once and keep the best fit. Raise `_StoppedError` after Ctrl-C."""
         fit = replace(self.model.minimise(start), widened=self.table.held(start.values))
         self.best = better(self.best, fit)
+        if fit.n_rows is None and self.model.hyper_prior is not None:
+            self.ends.append(fit.values)
         if self.model.monitor.stopped:
             raise _StoppedError
         return fit
@@ -153,12 +155,9 @@ class Search:
         free, everything = bool(self.table["noise"].free.any()), n_rows is None
         much = self.rules.much_noise if free and (self.model.interpolates or not everything) else None
         best = self._fit(Start(values, until, None, n_rows, cold=True))
-        selected = self.model.by_forward_selection()
-        if everything and until > 0 and selected is not None:
-            self.ends.append(best.values)
-            fit = self._fit(Start(values | selected, until, None, cold=True))
-            self.ends.append(fit.values)
-            best, much = better(best, fit), None
+        selected = self.model.by_forward_selection() if everything and until > 0 else None
+        if selected is not None:
+            best = better(best, self._fit(Start(values | selected, until, None, cold=True)))
         if until == 0 or not free:
             return best
         starts = list(self.rules.other_starts)

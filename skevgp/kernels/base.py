@@ -172,6 +172,10 @@ class CovarianceAt(ABC):
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return gradients in log hyperparameters and in inducing points; ``K_bar``, that in `matrix`, is symmetric."""
 
+    def hyper_gradient(self, K: np.ndarray, K_bar: np.ndarray) -> np.ndarray:
+        """Return the gradient in log hyperparameters alone, given K = `matrix` (a subclass may reuse it) and K̄."""
+        return self.finish_pullback(self.start_pullback(), K_bar)[0]
+
 
 class Covariance(ABC):
     """A covariance k̃ with positive hyperparameters. All methods take their values; gradients are in their logarithms.

@@ -519,6 +519,9 @@ class SquaredExponentialAt(StationaryAt):
     def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._geometry_bar(total, K_bar * self.matrix())
 
+    def hyper_gradient(self, K: np.ndarray, K_bar: np.ndarray) -> np.ndarray:
+        return self._geometry_bar(self.start_pullback(), K_bar * K)[0]
+
 
 # --- from scikit-learn's kernels ---------------------------------------------------------------------------------
 

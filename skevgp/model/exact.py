@@ -89,12 +89,18 @@ class OutputGivenKernel:
     def join(outputs: Sequence[OutputGivenKernel]) -> None:
         """Compute the weights w that some outputs share, from all of their rows."""
         proper, reference = ~outputs[0].vague, outputs[0].reference
+        if not len(proper):
+            for output in outputs:
+                output.R = output.R_inv = np.empty((0, 0))
+                output.w = output.from_prior = np.empty(0)
+                output.errors, output.is_first = output.z, output is outputs[0]
+            return
         # [W; D] w = [z; -D w₀] by least squares.
         Q, R = np.linalg.qr(np.vstack([*(output.W for output in outputs), np.diag(proper.astype(float))]))
-        R_inv = lapack.dtrtri(R)[0] if len(R) else R
+        R_inv = lapack.dtrtri(R)[0]
         wanted = Q.T @ np.concatenate([*(output.z for output in outputs), np.where(proper, -reference, 0.0)])
         # A solve instead of the inverse: features of 1e16 times the noise would multiply the errors of the inverse.
-        w = lapack.dtrtrs(R, wanted)[0] if len(R) else wanted
+        w = lapack.dtrtrs(R, wanted)[0]
         for output in outputs:
             output.R, output.R_inv, output.w, output.is_first = R, R_inv, w, output is outputs[0]
             output.errors = output.z - output.W @ w
@@ -118,12 +124,13 @@ class OutputGivenKernel:
         # of the covariance of this output's rows, or its limit for vague weights. Here α and P are in units of 1/s and
         # 1/s². In their own units, α² may overflow.
         alpha, n = self.L_inv.T @ self.errors, len(self.L)
-        WR = self.W @ self.R_inv
-        from_weights = self.L_inv.T @ WR
-        P = symmetric_inverse(self.L_inv) - from_weights @ from_weights.T
+        P, explained = symmetric_inverse(self.L_inv), 0.0
+        if len(self.R):
+            WR = self.W @ self.R_inv
+            from_weights, explained = self.L_inv.T @ WR, float(np.vdot(WR, WR))
+            P -= from_weights @ from_weights.T
         in_noise = alpha**2 - diagonal_of(P)
         squares = float(self.errors @ self.errors)
-        explained = float(np.vdot(WR, WR))
         noise_bar = 0.5 * self.ratio * float(in_noise.sum() if self.relative is None else in_noise @ self.relative)
         P *= -1.0
         P += np.multiply.outer(alpha, alpha)
@@ -138,8 +145,8 @@ class OutputGivenKernel:
         return np.concatenate([self.errors, self.w]), root
 
 
-# The kernel at the rows, for all outputs or for each, and each output given it.
-OutputsGivenKernel = tuple[list[Any], list[OutputGivenKernel]]
+# The kernel at the rows with its matrix, for all outputs or for each, and each output given it.
+OutputsGivenKernel = tuple[list[tuple[Any, np.ndarray]], list[OutputGivenKernel]]
 
 
 @dataclass(frozen=True)
@@ -218,7 +225,7 @@ class ExactModel:
         return replace(self, prior=prior, vague=np.zeros((o, width), dtype=bool), rows=rows)
 
     def outputs(self, values: Values) -> OutputsGivenKernel:
-        """The kernel at the rows, for all outputs or for each, and each output given it."""
+        """The kernel at the rows with its matrix, for all outputs or for each, and each output given it."""
         hyperparameters, o = values["hyperparameters"], len(self.vague)
         prior = self.prior.at(values)
         rows_by_output = [self.rows.of(slice(output, output + 1)) for output in range(o)]
@@ -227,10 +234,10 @@ class ExactModel:
             kernel.at(hyperparameters, rows.inputs)
             for kernel, rows in zip(self.kernels or (self.kernel,), rows_by_output, strict=False)
         ]
-        matrices = [at.matrix() for at in covariances]
+        matrices = [(at, at.matrix()) for at in covariances]
         outputs = [
             OutputGivenKernel(
-                K=matrices[index % len(matrices)],
+                K=matrices[index % len(matrices)][1],
                 H=rows.features,
                 r=rows.targets[:, 0],
                 signal=values["signal"][index],
@@ -243,7 +250,7 @@ class ExactModel:
         ]
         for together in [outputs] if self.prior.shared else [[output] for output in outputs]:
             OutputGivenKernel.join(together)
-        return covariances, outputs
+        return matrices, outputs
 
     def log_likelihoods(self, values: Values, outputs: OutputsGivenKernel | None = None) -> np.ndarray:
         """The log likelihood (o,) of each output, in nats, or -inf if it cannot be computed.
@@ -273,8 +280,8 @@ class ExactModel:
                 gradient["coef_factors"][0 if self.prior.shared else index] += of_groups[0]
         # The factor for copies of rows has the power -Σ (w - 1) / 2 of σ².
         gradient["noise"] -= 0.5 * (self.rows.total - len(self.rows.inputs))
-        for at, K_bar in zip(covariances, K_bars, strict=True):
-            gradient["hyperparameters"] += at.finish_pullback(at.start_pullback(), K_bar)[0]
+        for (at, K), K_bar in zip(covariances, K_bars, strict=True):
+            gradient["hyperparameters"] += at.hyper_gradient(K, K_bar)
         return total, gradient
 
     def _of_copies(self, values: Values) -> np.ndarray:
@@ -305,7 +312,7 @@ class ExactModel:
                     kernel=self.kernel if self.kernels is None else self.kernels[index],
                     hyperparameters=values["hyperparameters"],
                     points=self.rows.of(columns).inputs,
-                    whitening=Whitening(covariances[index % len(covariances)], output.L, output.L_inv),
+                    whitening=Whitening(covariances[index % len(covariances)][0], output.L, output.L_inv),
                     signal=values["signal"][columns],
                     prior=self.prior.at(values).outputs(columns),
                     mean=[mean],
