@@ -183,6 +183,14 @@ def test_placeholder_masses_warn(factor):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
 
 
+def test_torques_that_are_mostly_noise_warn():
+    """Two thirds of the variance of the second joint are noise."""
+    arm = Arm("acrobot", n_groups=1, dt=0.2)
+    y = arm.y + [0.0, np.sqrt(2.0) * arm.y[:, 1].std()] * np.random.RandomState(0).randn(*arm.y.shape)
+    with pytest.warns(ConvergenceWarning, match=r"half of the variance of the torques of \[[^,]*\] is explained"):
+        InverseDynamics("acrobot", n_inducing=0).fit(arm.X, y, groups=arm.groups)
+
+
 # Where no Gaussian process is confirmed, a fit with one ends as a fit without.
 @pytest.mark.parametrize(
     ("robot", "scale", "n_inducing"),

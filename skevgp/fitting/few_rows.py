@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..model.parameters import ParameterTable, Values
-from ..solvers.base import Objective
+from ..solvers.base import Limits, Objective
 from ..utils.linalg import NotPositiveDefiniteError
 
 # The prior of a length scale: log(length scale / std of the column) ~ N(√2 + ½ log d, 3) for d columns (Hvarfner,
@@ -141,7 +141,7 @@ def forward_selection(energy: Objective, table: ParameterTable, prior: HyperPrio
 def drawn(
     energy: Objective,
     modes: Sequence[np.ndarray],
-    limits: tuple[np.ndarray, np.ndarray],
+    limits: Limits,
     rng: np.random.RandomState,
     seen: Callable[[float], None],
 ) -> list[np.ndarray]:
@@ -170,7 +170,7 @@ def _chain(
     energy: Objective,
     mode: np.ndarray,
     unit: np.ndarray,
-    limits: tuple[np.ndarray, np.ndarray],
+    limits: Limits,
     n_draws: int,
     rng: np.random.RandomState,
     seen: Callable[[float], None],
@@ -225,9 +225,7 @@ def _on_grid(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
     return np.round(x / (_GRID * unit)) * (_GRID * unit)
 
 
-def _reflected(
-    x: np.ndarray, momentum: np.ndarray, limits: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def _reflected(x: np.ndarray, momentum: np.ndarray, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
     """A position within the limits, and its momentum."""
     lower, upper = limits
     low, high = x < lower, x > upper

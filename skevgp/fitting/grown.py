@@ -39,6 +39,7 @@ def grown(model: Model) -> tuple[Model, Fit]:
     iterations, tol = _ITERATIONS if model.max_iter > 0 else 0, model.tol or 0.0
     coarse = replace(model, max_iter=iterations, tol=max(tol, _COARSE * nats))
     fit = search(coarse)
+    others = fit.others
     with model.monitor.keeping_the_best():
         unhindered = None if model.monitor.stopped else exact_model_of_sample(model, _ITERATIONS, _COARSE)
         while not model.monitor.stopped and (more := coarse.with_more(fit.values)) is not None:
@@ -52,7 +53,7 @@ def grown(model: Model) -> tuple[Model, Fit]:
     model = replace(coarse, max_iter=model.max_iter, tol=model.tol)
     if model.max_iter > 0 and not model.monitor.stopped:
         fit = better(fit, model.minimise(Start(fit.values, model.max_iter)))
-    return model, fit
+    return model, replace(fit, others=(fit.values, *others) if others else ())
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Unhindered:
         assert exact is not None
         # A fit gains about half a nat per parameter by chance.
         likelihood, by_chance = float(exact.log_likelihoods(values).sum()), 0.5 * self.model.table.size
-        return (self.fit.bound - by_chance - likelihood) / (exact.rows.total * exact.rows.targets.shape[1])
+        best = self.fit.bound - self.model.log_hyper_prior(self.fit.values)
+        return (best - by_chance - likelihood) / (exact.rows.total * exact.rows.targets.shape[1])
 
 
 def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered | None:

@@ -157,20 +157,22 @@ class Model:
         """The prior of kernel and noise. None if there are enough rows, or if there is no such prior for the model."""
         problem, table = self.problem, self.table
         n_free = sum(table[name].free.sum() for name in ("hyperparameters", "signal", "noise"))
-        weight = 1.0 - self.rows.total / max(self.rules.few_rows * n_free, 1.0)
+        share = self.rows.total / max(self.rules.few_rows * n_free, 1.0)
         unsupported = (
             not problem.solver.takes_prior
             or problem.noise.heavy_tails
-            or problem.variant != replace(problem.variant, family="full", orthogonal=False, n_neighbors=0)
+            or problem.variant.family != "full"
+            or problem.variant.n_neighbors > 0
+            or (problem.variant.orthogonal and self.sparse.prior.scale.size > 0)
             or self.sparse.kernels is not None
             or self.sparse.prior.shared
         )
-        if weight <= 0.0 or unsupported or self.max_iter == 0 or not table["hyperparameters"].free.any():
+        if share >= 1.0 or unsupported or self.max_iter == 0 or not table["hyperparameters"].free.any():
             return None
         if self.rows.is_constant().any():
             return None
         scale, scatter = self.rows.inputs.scale, self.scatter
-        return few_rows.HyperPrior.of(table, self.lengthscale_mask, scale, scatter, weight)
+        return few_rows.HyperPrior.of(table, self.lengthscale_mask, scale, scatter, np.sqrt(1.0 - share))
 
     def log_hyper_prior(self, values: Values) -> float:
         """The log prior density of kernel and noise, which the objective has."""
@@ -187,8 +189,12 @@ class Model:
 
     def draws(self, fit: Fit) -> list[Values]:
         """Draws of kernel and noise from their posterior around the ends of a search. Empty if it was stopped."""
+        assert self.hyper_prior is not None
         table, monitor = self.table.started_at(fit.values).changed("inducing_points", fixed=True), self.monitor.silent()
         objective, limits, tolerance = self.objective(table), table.limits(), Tolerance(_MODE_TOL / self.rows.total)
+        # The chain moves in coordinates that do not depend on units.
+        medians = {name: np.exp(mean) for name, mean in self.hyper_prior.means.items()}
+        energy, origin = self._energy(table), table.started_at(medians).start()
         modes: list[np.ndarray] = []
         for values in fit.others or (fit.values,):
             start, curvature = np.clip(table.started_at(values).start(), *limits), (objective, table.alike())
@@ -196,8 +202,9 @@ class Model:
         found: list[np.ndarray] = []
         with monitor.keeping_the_best():
             rng, seen = np.random.RandomState(0), partial(monitor.iteration, 0)
-            found = few_rows.drawn(self._energy(table), modes, limits, rng, seen)
-        return [table.values(x) for x in found]
+            shifted, edges = [mode - origin for mode in modes], (limits[0] - origin, limits[1] - origin)
+            found = few_rows.drawn(lambda z: energy(origin + z), shifted, edges, rng, seen)
+        return [table.values(origin + z) for z in found]
 
     def _energy(self, table: ParameterTable) -> Objective:
         """Minus the bound and the log prior, in nats, and its gradient."""

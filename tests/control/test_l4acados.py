@@ -51,7 +51,7 @@ class Controller:
 def rows():
     """Rows of two states and an input: to fit, and the stages of a plan."""
     rng = np.random.RandomState(0)
-    return rng.uniform(-1.0, 1.0, (80, 3)), rng.uniform(-1.0, 1.0, (7, 3))
+    return rng.uniform(-1.0, 1.0, (90, 3)), rng.uniform(-1.0, 1.0, (7, 3))
 
 
 @pytest.fixture(scope="module")

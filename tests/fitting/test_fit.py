@@ -74,12 +74,19 @@ def test_ctrl_c_keeps_what_each_model_has(n_threads):
     assert np.isfinite(done.lower_bound)
 
 
+@pytest.fixture
+def _many_rows(monkeypatch):
+    """Rows count as many, so that there is no prior of kernel and noise."""
+    monkeypatch.setattr(rules, "RULES", replace(rules.RULES, few_rows=0.0))
+
+
 def sampled(monkeypatch, **changes):
     """A model whose fit begins with 15, then 30 of its rows."""
     monkeypatch.setattr(rules, "RULES", replace(rules.RULES, sample=(15, 1), growth=2, stage=5))
     return model_of(n_inducing=5, **changes)
 
 
+@pytest.mark.usefixtures("_many_rows")
 def test_fit_that_begins_with_samples_ends_with_all_rows(monkeypatch):
     model = model_of(n_inducing=5, max_iter=200)
     plain = finished(model, search.search(model))
@@ -94,6 +101,7 @@ def test_fit_that_begins_with_samples_ends_with_all_rows(monkeypatch):
 # --- one model --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("_many_rows")
 def test_calibrated_are_signal_and_noise_and_q_is_at_its_optimum_for_them():
     model = model_of(noise_cv=CrossValidation(5))
     found = started(model)

@@ -45,6 +45,9 @@ def model(**changes):
         "warm": None,
         "placed": False,
         "monitor": Monitor(),
+        "hyper_prior": None,
+        "log_hyper_prior": lambda values: 0.0,
+        "by_forward_selection": lambda: None,
     }
     return SimpleNamespace(**own | changes)
 

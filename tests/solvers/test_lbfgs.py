@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import rosen, rosen_der
 
 from skevgp.solvers import LBFGS
-from skevgp.solvers.base import Tolerance
+from skevgp.solvers.base import Guarded, Tolerance
 from skevgp.solvers.lbfgs import curvature_units
 from skevgp.utils.linalg import NotPositiveDefiniteError
 from skevgp.utils.monitor import Monitor
@@ -31,6 +31,18 @@ def test_lbfgs_finds_the_minimum_and_reports_each_iteration():
     assert [i for i, _ in seen] == list(range(1, minimum.n_iter + 1))
     assert [loss for _, loss in seen] == minimum.loss_curve
     assert (np.diff(minimum.loss_curve) <= 1e-15).all()
+
+
+def test_losses_far_above_the_best_grow_as_their_logarithm_with_the_slope_to_match():
+    guarded = Guarded(lambda x: (float(np.exp(x[0])), np.exp(x)), np.zeros(1))
+    assert guarded(np.zeros(1))[0] == 1.0  # the best; from 20 above it, a loss is far
+    for x in (2.0, 5.0, 50.0):
+        excess = np.exp(x) - 1.0
+        expected = excess if excess < 20.0 else 20.0 * (1.0 + np.log(excess / 20.0))
+        loss, slope = guarded(np.array([x]))
+        assert loss == pytest.approx(1.0 + expected, rel=1e-12)
+        nearby = [guarded(np.array([x + step]))[0] for step in (-1e-5, 1e-5)]
+        assert slope[0] == pytest.approx((nearby[1] - nearby[0]) / 2e-5, rel=1e-6)
 
 
 def test_lbfgs_says_that_iterations_ran_out_and_none_keep_the_start():
