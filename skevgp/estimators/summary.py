@@ -65,7 +65,7 @@ class ModelSummary:
     lower_bound, upper_bound : float or None
         Bounds on the log marginal likelihood, in nats, which are equal for an exact model. None if they are not known.
     advice : str
-        Text on what ``n_neighbors`` would gain, or empty.
+        Text on what ``n_neighbors`` would gain, or on few rows, or empty.
 
     Examples
     --------
@@ -234,7 +234,7 @@ def of_gaussian_process(model: Any) -> ModelSummary:
         tuple(numbers),
         lower,
         upper,
-        _advice(model._gain_of_neighbours),
+        _advice(model),
     )
 
 
@@ -313,11 +313,19 @@ def _certificate(lower: Any, upper: Any) -> str:
     return f"log marginal likelihood: from {lower:.2f} to {upper:.2f} nats"
 
 
-def _advice(gain: float | None) -> str:
-    """Text on the share of the error that a local part would take away."""
-    if gain is None or 100.0 * gain < _LITTLE:
+def _advice(model: Any) -> str:
+    """Text on the share of the error that a local part would take away, or on few rows."""
+    gain, few, n_draws = model._gain_of_neighbours, model._fitted.few, model._fitted.n_draws
+    if gain is not None and 100.0 * gain >= _LITTLE:
+        return f"n_neighbors=60 would lower the error by at least about {100.0 * gain:.0f} %"
+    if few is None:
         return ""
-    return f"n_neighbors=60 would lower the error by at least about {100.0 * gain:.0f} %"
+    n_rows, n_numbers = few
+    then = f"predictions are averaged over {n_draws} draws of these" if n_draws else "std may be too small"
+    said = f"{n_rows} rows are few for {n_numbers} numbers of kernel and noise: {then}"
+    if n_numbers < n_rows:
+        return said
+    return f"{said}. A kernel with one length scale, such as RBF(1.0), or fewer columns may predict better"
 
 
 def _plus_minus(value: float, std: float) -> str:

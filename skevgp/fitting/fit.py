@@ -87,7 +87,7 @@ def _with_local_part(model: Model) -> FittedModel:
     values, _ = with_signal_of_constants(model.problem, model.rows, model.table, values)
     posterior = LocalPosterior.of(model.sparse, values, local_model(model))
     message = " ".join(part for part in messages if part)
-    return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent)
+    return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, few=_few(model))
 
 
 def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedModel:
@@ -116,7 +116,13 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
         posterior = posterior.with_q(fit.predictor, fit.bound - log_prior(values))
     posterior = _averaged(model, fit, posterior)
     message = " ".join(part for part in messages if part)
-    return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, gone, doubts)
+    few = _few(model)
+    return FittedModel(model.outputs, posterior, model.table, fit.loss_curve, message, dependent, gone, doubts, few)
+
+
+def _few(model: Model) -> tuple[int, int] | None:
+    """The numbers of rows and of learned numbers of kernel and noise, if the rows are few for these."""
+    return (round(model.rows.total), model.n_learned) if model.has_few_rows else None
 
 
 def _averaged(model: Model, fit: Fit, posterior: FittedPosterior) -> FittedPosterior:

@@ -36,6 +36,8 @@ class FittedModel:
     gone: int = 0
     # Only for noise with heavy tails.
     doubts: RowDoubts | None = None
+    # The numbers of rows and of learned numbers of kernel and noise, if the rows are few for these.
+    few: tuple[int, int] | None = None
 
     @property
     def sparse(self) -> SparseModel:
@@ -114,6 +116,11 @@ class Fitted:
             for model in self.models
         )
         return replace(self, models=tuple(models))
+
+    @property
+    def few(self) -> tuple[int, int] | None:
+        """The numbers of rows and of learned numbers of kernel and noise of a model, if the rows are few for these."""
+        return next((model.few for model in self.models if model.few is not None), None)
 
     @property
     def n_draws(self) -> int:

@@ -152,12 +152,20 @@ class Model:
             return objective
         return few_rows.WithPrior(objective, table, self.hyper_prior, self.rows.total)
 
+    @property
+    def n_learned(self) -> int:
+        """Number of free hyperparameters, signal and noise variances."""
+        return int(sum(self.table[name].free.sum() for name in ("hyperparameters", "signal", "noise")))
+
+    @property
+    def has_few_rows(self) -> bool:
+        """Whether rows are few for the learned numbers of kernel and noise."""
+        return self.max_iter > 0 and self.rows.total < self.rules.few_rows * self.n_learned
+
     @cached_property
     def hyper_prior(self) -> few_rows.HyperPrior | None:
         """The prior of kernel and noise. None if there are enough rows, or if there is no such prior for the model."""
         problem, table = self.problem, self.table
-        n_free = sum(table[name].free.sum() for name in ("hyperparameters", "signal", "noise"))
-        share = self.rows.total / max(self.rules.few_rows * n_free, 1.0)
         unsupported = (
             not problem.solver.takes_prior
             or problem.noise.heavy_tails
@@ -167,12 +175,12 @@ class Model:
             or self.sparse.kernels is not None
             or self.sparse.prior.shared
         )
-        if share >= 1.0 or unsupported or self.max_iter == 0 or not table["hyperparameters"].free.any():
+        if unsupported or not self.has_few_rows or not table["hyperparameters"].free.any():
             return None
         if self.rows.is_constant().any():
             return None
-        scale, scatter = self.rows.inputs.scale, self.scatter
-        return few_rows.HyperPrior.of(table, self.lengthscale_mask, scale, scatter, np.sqrt(1.0 - share))
+        weight = np.sqrt(1.0 - self.rows.total / (self.rules.few_rows * self.n_learned))
+        return few_rows.HyperPrior.of(table, self.lengthscale_mask, self.rows.inputs.scale, self.scatter, weight)
 
     def log_hyper_prior(self, values: Values) -> float:
         """The log prior density of kernel and noise, which the objective has."""
