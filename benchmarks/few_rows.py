@@ -183,7 +183,7 @@ def run(cell: Cell, home: Path | None, python: Path | None, quick: bool = False)
                 raise SystemExit("nuts needs --peer-python.")
             start = time.process_time()
             mean, std = by_nuts(data, python)
-            seconds = time.process_time() - start
+            seconds, predicted = time.process_time() - start, np.nan
         else:
             model = build(cell.set, name, data.X.shape[1])
             if quick and "max_iter" in model.get_params():
@@ -192,9 +192,12 @@ def run(cell: Cell, home: Path | None, python: Path | None, quick: bool = False)
             with without_draws(name == "likeliest"):
                 seconds, _ = harness.timed(partial(model.fit, data.X, data.y, **options))
             with harness.one_thread():
+                start = time.process_time()
                 mean, std = model.predict(data.X_test, return_std=True)
+                predicted = time.process_time() - start
         size = {"rows": len(data.X), "columns": data.X.shape[1]}
-        rows.append({"model": name, **size, **scores(mean, std, data.y_test), "seconds": round(seconds, 3)})
+        times = {"seconds": round(seconds, 3), "us_per_prediction": round(1e6 * predicted / len(data.X_test), 2)}
+        rows.append({"model": name, **size, **scores(mean, std, data.y_test), **times})
     return rows
 
 
@@ -216,6 +219,8 @@ def tables(rows: pd.DataFrame) -> harness.Tables:
         return {"sets": lines}
     seconds = wide["seconds"]["evgp"] / wide["seconds"]["likeliest"]
     lines["× seconds"] = harness.text(seconds.reset_index(drop=True), 2)
+    micros = kept.pivot_table(index="set", columns="model", values="us_per_prediction").loc[order]
+    slower = micros["evgp"] / micros["likeliest"]
     ratio, gain = wide["rmse"]["evgp"] / wide["rmse"]["likeliest"], wide["nlpd"]["evgp"] - wide["nlpd"]["likeliest"]
     made, systems = wide.index.isin([*SETS[: len(MADE) + 1]]), wide.index.str.endswith(("IFG", "RES"))
     summary = []
@@ -236,6 +241,7 @@ def tables(rows: pd.DataFrame) -> harness.Tables:
                 "RMSE, geometric mean of ratios": float(np.exp(np.log(ratio[chosen]).mean())),
                 "largest ratio of RMSE": float(ratio[chosen].max()),
                 "seconds, geometric mean of ratios": float(np.exp(np.log(seconds[chosen]).mean())),
+                "seconds of a prediction": float(np.exp(np.log(slower[chosen]).mean())),
             }
         )
     return {"summary": pd.DataFrame(summary), "sets": lines}

@@ -28,7 +28,7 @@ These numbers of the code are no rules, and are not switched off:
   `_FACTORS`, `_LENGTH_FACTORS`, `_NOISE_FACTORS`, and tolerances `_ITERATIONS`, `_TOLERANCE`, `_ROUNDS`, `_GAIN`,
   `_REACH`, `_CLOSE`;
 * refusals of input: `problem._LARGEST_SPREAD`, `start.checked_variance`;
-* numbers of a model: `student_t._NU`, `_WIDTH`, `_SHARE`;
+* numbers of a model: `student_t._NU`, `_WIDTH`, `_SHARE`, and those of the prior and the chain in `few_rows.py`;
 * Adam: `model._FLAT`, `_NATURAL_RATES`, and the constants of `solvers/adam`.
 """
 
@@ -173,6 +173,10 @@ RULES_OFF = {
     "first-noise": Rule("the noise starts low", (field(first_noise=0.5),)),
     "other-starts": Rule("other starts after a collapsed fit", (field(other_starts=()),)),
     "much-noise": Rule("a second start with much noise", (field(much_noise=None),)),
+    "few-rows": Rule("a prior of kernel and noise, and an average over draws", (field(few_rows=0.0),)),
+    "forward-selection": Rule(
+        "a start by forward selection", (constant(model.Model, "by_forward_selection", lambda self: None),)
+    ),
     "place-again": Rule("inducing points are placed again", (constant(inducing.Placement, "anew", None),), "sparse"),
     "old-places": Rule(
         "the fit from the old places goes on too",

@@ -107,6 +107,7 @@ SMOKE = [
     smoke("parameters", "misfit"),
     smoke("parameters", "cost"),
     smoke("bounds"),
+    smoke("few_rows"),
     smoke("calibration", "--systems pendulum"),
     smoke("tables", "models --sets toy-200"),
     smoke("tables", "inducing --sets toy-200"),
