@@ -223,8 +223,13 @@ def tables(rows: pd.DataFrame) -> harness.Tables:
     slower = micros["evgp"] / micros["likeliest"]
     ratio, gain = wide["rmse"]["evgp"] / wide["rmse"]["likeliest"], wide["nlpd"]["evgp"] - wide["nlpd"]["likeliest"]
     made, systems = wide.index.isin([*SETS[: len(MADE) + 1]]), wide.index.str.endswith(("IFG", "RES"))
+    same = ((gain == 0.0) & (ratio == 1.0)).to_numpy()
+    kinds = {"made sets": made, "tables": ~made & ~systems, "systems": systems}
     summary = []
-    for label, chosen in (("made sets", made), ("tables", ~made & ~systems), ("systems", systems)):
+    for label, chosen in (
+        *((f"{name}, few rows", own & ~same) for name, own in kinds.items()),
+        *((f"{name}, enough rows: the same fit", own & same) for name, own in kinds.items()),
+    ):
         if not chosen.any():
             continue
         enough = chosen & (size >= 50).to_numpy()
@@ -236,7 +241,7 @@ def tables(rows: pd.DataFrame) -> harness.Tables:
                 "least coverage, n ≥ 50": float(coverage["evgp"].min()),
                 "greatest": float(coverage["evgp"].max()),
                 "least of likeliest": float(coverage["likeliest"].min()),
-                "NLPD is better in": f"{int((gain[chosen] <= 0.0).sum())} of {int(chosen.sum())}",
+                "NLPD is lower in": f"{int((gain[chosen] < 0.0).sum())} of {int(chosen.sum())}",
                 "largest loss of NLPD": float(gain[chosen].max()),
                 "RMSE, geometric mean of ratios": float(np.exp(np.log(ratio[chosen]).mean())),
                 "largest ratio of RMSE": float(ratio[chosen].max()),

@@ -76,26 +76,34 @@ class HyperPrior:
             means["hyperparameters"][...], stds["hyperparameters"][...] = length.mean(), _LENGTH_STD
         return cls(weight, means, stds, columns)
 
-    def __call__(self, values: Values) -> tuple[float, Values]:
-        """The log density without its constant, and its gradient in the logarithms."""
-        total, gradient = 0.0, {name: np.zeros(value.shape) for name, value in values.items()}
-        for name, mean in self.means.items():
-            distance = (np.log(values[name]) - mean) / self.stds[name]
-            total -= 0.5 * self.weight * float(np.sum(distance**2))
-            gradient[name] = -self.weight * distance / self.stds[name]
-        return total, gradient
+    def log_density(self, values: Values) -> float:
+        """The log density, times the weight and without its constant."""
+        distances = [(np.log(values[name]) - mean) / self.stds[name] for name, mean in self.means.items()]
+        return -0.5 * self.weight * float(sum(np.sum(distance**2) for distance in distances))
 
 
 class WithPrior:
     """Minus the bound and the log prior, per row, and its gradient, as a function of the flat vector."""
 
     def __init__(self, objective: Objective, table: ParameterTable, prior: HyperPrior, n_rows: float):
-        self.objective, self.table, self.prior, self.n_rows = objective, table, prior, n_rows
+        # The coordinates of these parameters are their logarithms. The others have no precision.
+        self.objective, values = objective, table.values_at_start()
+        means = {name: prior.means.get(name, np.zeros(value.shape)) for name, value in values.items()}
+        precisions = {
+            name: prior.weight / prior.stds[name] ** 2 if name in prior.stds else np.zeros(value.shape)
+            for name, value in values.items()
+        }
+        self._mean, self._precision, self._n_rows = table.flat(means), table.flat(precisions), n_rows
+        # The part of fixed values is constant.
+        free = 0.5 * float(self._precision @ (table.start() - self._mean) ** 2)
+        self._of_fixed = -prior.log_density(values) - free
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
         loss, slopes = self.objective(flat)
-        value, gradient = self.prior(self.table.values(flat))
-        return loss - value / self.n_rows, slopes - self.table.gradient(gradient) / self.n_rows
+        distance = flat - self._mean
+        slope = self._precision * distance
+        energy = 0.5 * float(distance @ slope) + self._of_fixed
+        return loss + energy / self._n_rows, slopes + slope / self._n_rows
 
 
 # --- a start ----------------------------------------------------------------------------------------------------------

@@ -184,7 +184,7 @@ class Model:
 
     def log_hyper_prior(self, values: Values) -> float:
         """The log prior density of kernel and noise, which the objective has."""
-        return 0.0 if self.hyper_prior is None else self.hyper_prior(values)[0]
+        return 0.0 if self.hyper_prior is None else self.hyper_prior.log_density(values)
 
     def by_forward_selection(self) -> Values | None:
         """The start of `few_rows.forward_selection`. None if rows are not few, or if there are not several columns."""

@@ -393,8 +393,8 @@ class Stationary(Covariance):
 
     def _split(self, hyperparameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parameters of φ, and the length scale of each column (d,)."""
-        parameters, lengthscales = np.split(hyperparameters, [self.profile.n_parameters])
-        return parameters, np.full(self.n_columns, lengthscales)
+        n_parameters = self.profile.n_parameters
+        return hyperparameters[:n_parameters], np.full(self.n_columns, hyperparameters[n_parameters:])
 
 
 class StationaryAt(CovarianceAt):

@@ -50,7 +50,7 @@ def test_prior_is_log_normal_in_units_of_the_columns_and_fades():
         return sum(np.sum(lognorm.logpdf(x, s, scale=scale) + np.log(x)) for x, s, scale in parts)
 
     others = {name: value * np.exp(RNG.uniform(-1.0, 1.0, value.shape)) for name, value in values.items()}
-    difference = prior(others)[0] - prior(values)[0]
+    difference = prior.log_density(others) - prior.log_density(values)
     assert difference == pytest.approx(prior.weight * (log_density(others) - log_density(values)))
     assert few(n=59).hyper_prior.weight < 0.15
     assert few(n=60).hyper_prior is None
