@@ -26,12 +26,12 @@ def kernel(A, B, length, signal):
 
 
 def model(X, y):
-    """The same priors as skevgp: length scales by Hvarfner, Hellsten & Nardi (2024)."""
+    """The same priors as skevgp (docs/guide/few_rows.md)."""
     n, d = X.shape
-    length = numpyro.sample("length", dist.LogNormal(jnp.full(d, np.sqrt(2.0) + 0.5 * np.log(d)), np.sqrt(3.0)))
-    signal = numpyro.sample("signal", dist.LogNormal(0.0, 2.0))
-    noise = numpyro.sample("noise", dist.LogNormal(np.log(1e-2), 3.0))
-    K = kernel(X, X, length, signal) + (noise + JITTER) * jnp.eye(n)
+    length = numpyro.sample("length", dist.LogNormal(jnp.full(d, 2.3 + 0.5 * np.log(d)), 1.4))
+    signal = numpyro.sample("signal", dist.LogNormal(0.0, 4.0))
+    noise = numpyro.sample("noise", dist.LogNormal(np.log(0.1), 2.0))
+    K = kernel(X, X, length, signal) + (noise + JITTER * signal) * jnp.eye(n)
     numpyro.sample("y", dist.MultivariateNormal(jnp.zeros(n), K), obs=y)
 
 
@@ -48,7 +48,7 @@ def main() -> None:
     means, variances = [], []
     for i in np.linspace(0, N_DRAWS - 1, N_USED).astype(int):
         length, signal, noise = (draws[name][i] for name in ("length", "signal", "noise"))
-        K = np.asarray(kernel(A, A, length, signal)) + (noise + JITTER) * np.eye(len(A))
+        K = np.asarray(kernel(A, A, length, signal)) + (noise + JITTER * signal) * np.eye(len(A))
         across = np.asarray(kernel(A, B, length, signal))
         V = np.linalg.solve(np.linalg.cholesky(K), across)
         means.append(across.T @ np.linalg.solve(K, (y - mean) / size))
