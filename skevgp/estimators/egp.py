@@ -446,7 +446,7 @@ Optimizer = Callable[..., tuple[np.ndarray, float]]
 class UserOptimizer(Solver):
     """A function of the user as a solver of the exact model. It sees logarithms in the user's units."""
 
-    takes_prior = False
+    takes_any_objective = False
     takes_widest_limits = True
 
     def __init__(self, optimizer: Optimizer, target_unit: np.ndarray, n_restarts: int = 0):

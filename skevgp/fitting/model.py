@@ -104,6 +104,10 @@ class Model:
         """Sizes of the samples that the fit begins with."""
         (o, p), (g, _, d) = self.sparse.prior.scale.shape, self.table["inducing_points"].start.shape
         width = d + p + o if self.sparse.kernels is None else g * (d + p) + o
+        if self.is_exact and self.problem.solver.takes_any_objective:
+            return replace(self.rules, sample=self.rules.exact_sample).samples(
+                len(self.rows), self.n_learned + p, width
+            )
         return () if self.interpolates else self.rules.samples(len(self.rows), self.n_inducing + p, width)
 
     @property
@@ -139,7 +143,12 @@ class Model:
         """
         if n_rows is not None:
             # A smaller sample is the first part of the larger one.
-            blocks = self.sparse.blocks(self._sample.subset(np.arange(n_rows)), self.n_inducing)
+            sample = self._sample.subset(np.arange(n_rows))
+            if self.is_exact:
+                return LikelihoodObjective(
+                    ExactModel.of(self.sparse, self.vague, sample.some(np.arange(n_rows))), table
+                )
+            blocks = self.sparse.blocks(sample, self.n_inducing)
             # It only gives a start. The bound of Titsias (2009) spreads points better: what they leave out costs more.
             loose = replace(self.sparse, variant=replace(self.sparse.variant, tight=False))
             return BoundObjective(loose, table, blocks)
@@ -167,7 +176,7 @@ class Model:
         """The prior of kernel and noise. None if there are enough rows, or if there is no such prior for the model."""
         problem, table = self.problem, self.table
         unsupported = (
-            not problem.solver.takes_prior
+            not problem.solver.takes_any_objective
             or problem.noise.heavy_tails
             or problem.variant.family != "full"
             or problem.variant.n_neighbors > 0

@@ -56,7 +56,7 @@ class Solver(StatefulEstimator):
 
     default_max_iter: ClassVar[int]  # for max_iter=None
     stochastic: ClassVar[bool] = False  # whether it takes mini-batches of the rows
-    takes_prior: ClassVar[bool] = True  # whether the objective may have a prior of kernel and noise
+    takes_any_objective: ClassVar[bool] = True  # such as one with a prior, or of a sample of the rows
     takes_widest_limits: ClassVar[bool] = False  # whether it gets the widest limits of signal and noise at once
 
     n_restarts: int
@@ -88,7 +88,7 @@ class MiniBatchSolver(Solver):
     """A solver that sees mini-batches of the rows. Its `minimise` has the arguments of `Adam.minimise`."""
 
     stochastic = True
-    takes_prior = False
+    takes_any_objective = False
 
     batch_size: int = 256
     learning_rate: float = 0.01
