@@ -7,6 +7,7 @@
     python benchmarks/speed.py rows        # time and memory up to a million rows, files and Dask: 5 minutes
     python benchmarks/speed.py million     # a million rows to the end, by L-BFGS and Adam: minutes of two cores
     python benchmarks/speed.py million --fits reference    # a thousand iterations: much longer
+    python benchmarks/speed.py exact       # EGPRegressor and scikit-learn's GPR, up to 2,000 rows: an hour
     python benchmarks/speed.py checkout --other ../older   # fits by this checkout and by another one, in pairs
 
     python benchmarks/speed.py checkout --other ../older --data ../data   # also torques of a real arm
@@ -28,6 +29,9 @@ threads, or run by Dask on two workers. Memory is the peak above that before the
 *million* has three kinds of fits. These are L-BFGS with its defaults, natural gradients on mini-batches for some
 epochs, and L-BFGS with a thousand iterations, which is the reference. "gained" is the gain over noise alone, as a share
 of that of the reference. The reference in the CSV did not begin on samples of the rows.
+
+*exact* has sines of 8 and 17 columns, with noise of std 0.1 and 0.0001 of a signal of std 1. Both models have the same
+kernel with the same bounds and starts.
 """
 
 from __future__ import annotations
@@ -50,7 +54,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from sklearn.gaussian_process.kernels import RBF
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from threadpoolctl import threadpool_limits
 
 import harness
@@ -58,7 +63,7 @@ from harness import figure_of
 from one_fit import JOBS
 from peers.adapters import microseconds
 from peers.against_peers import work
-from skevgp import EVGPRegressor
+from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
 from skevgp.metrics import negative_log_predictive_density
@@ -464,6 +469,62 @@ def million_tables(rows: pd.DataFrame) -> harness.Tables:
     return {"million": pd.DataFrame({**columns, "NLPD": rows["nlpd"].map("{:.4f}".format)})}
 
 
+# --- exact fits ----------------------------------------------------------------------------------------------------
+
+Exact = namedtuple("Exact", "n_rows columns noise seed")
+
+
+def exact_cells(options: Any) -> list[Exact]:
+    sizes, columns = ((60,), (3,)) if options.quick else ((500, 1000, 2000), (8, 17))
+    return [Exact(*cell) for cell in itertools.product(sizes, columns, (0.1, 1e-4), options.seeds)]
+
+
+def run_exact(cell: Exact, options: Any) -> list[dict[str, Any]]:
+    """Fit `EGPRegressor` and scikit-learn's GPR with the same kernel, one after the other, on all cores."""
+    rng = np.random.RandomState(cell.seed)
+    X, _, truth = next(harness.noisy_waves(cell.n_rows + 1000, cell.columns, rng))
+    y = (truth - truth.mean()) / truth.std() + cell.noise * rng.standard_normal(len(X))
+    n = cell.n_rows
+    y -= y[:n].mean()
+    kernel = ConstantKernel(1.0) * RBF(np.ones(cell.columns)) + WhiteKernel(0.1, (1e-12, 1e3))
+    found = []
+    for model in (EGPRegressor(kernel=kernel, normalize_y=False), GaussianProcessRegressor(kernel)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            start, cpu_start = time.perf_counter(), time.process_time()
+            model.fit(X[:n], y[:n])
+            seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
+            mean, std = model.predict(X[n:], return_std=True)
+        found.append(
+            {
+                "model": type(model).__name__,
+                "seconds": seconds,
+                "cpu_seconds": cpu_seconds,
+                "likelihood_per_row": model.log_marginal_likelihood_value_ / n,
+                "rmse": float(np.sqrt(np.mean((y[n:] - mean) ** 2))),
+                "nlpd": negative_log_predictive_density(y[n:, np.newaxis], mean[:, np.newaxis], std[:, np.newaxis]),
+            }
+        )
+    return found
+
+
+def exact_tables(rows: pd.DataFrame) -> harness.Tables:
+    keys = ["n_rows", "columns", "noise"]
+    wide = rows.pivot_table(
+        index=keys, columns="model", values=["seconds", "cpu_seconds", "likelihood_per_row", "rmse"]
+    )
+    ours, other = "EGPRegressor", "GaussianProcessRegressor"
+    table = {name: wide.index.get_level_values(name) for name in keys}
+    for label, name in (("s", "seconds"), ("CPU s", "cpu_seconds")):
+        for model in (ours, other):
+            table[f"{model}, {label}"] = wide[name][model].to_numpy()
+    table["times as fast"] = (wide["seconds"][other] / wide["seconds"][ours]).to_numpy()
+    for label, name in (("likelihood per row", "likelihood_per_row"), ("RMSE", "rmse")):
+        for model in (ours, other):
+            table[f"{label}, {model}"] = wide[name][model].map("{:.4f}".format).to_numpy()
+    return {"exact": pd.DataFrame(table)}
+
+
 # --- checkout ------------------------------------------------------------------------------------------------------
 
 Checkout = namedtuple("Checkout", "job checkout commit seed repeat")
@@ -524,6 +585,7 @@ PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables,
     ),
     "rows": ("scaling", rows_cells, run_rows, rows_tables, "Time and memory over rows"),
     "million": ("many_rows", million_cells, run_million, million_tables, "A fit to 1,000,000 rows"),
+    "exact": ("exact_fits", exact_cells, run_exact, exact_tables, "Exact fits"),
     "checkout": ("checkout", checkout_cells, run_checkout, checkout_tables, "This checkout against another"),
 }
 

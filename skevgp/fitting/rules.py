@@ -57,8 +57,8 @@ class Rules:
     stage: int | None = None
     # The first sample has so many rows, or so many per inducing point and feature if that is more. None: all rows.
     sample: tuple[int, int] | None = None
-    # The same for the exact model, whose time grows with the cube of the rows: so many rows, or so many for each learned
-    # number of kernel, noise and weights.
+    # The same for the exact model, whose time grows with the cube of the rows: so many rows, or so many for each
+    # learned number of kernel, noise and weights.
     exact_sample: tuple[int, int] | None = None
     # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
     # `LARGEST_SAMPLE`, are left out.

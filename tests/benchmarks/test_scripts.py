@@ -93,6 +93,7 @@ SMOKE = [
     smoke("speed", "evaluation", long=False),
     smoke("speed", "rows"),
     smoke("speed", "million"),
+    smoke("speed", "exact"),
     smoke("speed", "checkout"),
     smoke("control", "rollouts --models EVGP-IFG"),
     smoke("control", "swing_up"),
