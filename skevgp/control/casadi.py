@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.linalg import eigh
 from ..data.rows import Columns
 from ..maps import Map, NoExpressionError
 from ..model.predictor import Predictor, PredictorGroup
+from ..model.roots import dense
 from ..utils.casadi import casadi
 
 # An inlined function lets a caller differentiate the mean without the variance, whose derivatives cost more.
@@ -58,18 +59,23 @@ class Exported:
         """Return all numbers that new rows may change as one vector, written to ``out`` if that is given."""
         return np.concatenate([np.ravel(part) for part in self._parts()], out=out)
 
+    @property
+    def _groups(self) -> list[PredictorGroup]:
+        """The groups, with roots that are arrays."""
+        return [replace(group, root=dense(group.root)) for group in self.predictor.groups]
+
     def _parts(self) -> list[np.ndarray]:
         """List the arrays of `parameters` in their order."""
         # For each group of o outputs with the same m inducing points: weights of the mean (o, m + p), then roots of the
         # covariance (o, k, m + p). After all groups: the offset of the features' weights (n_outputs, p), the intercept
         # (n_outputs,) and the noise variances (n_outputs,).
-        each = [part for group in self.predictor.groups for part in (group.mean, group.root)]
+        each = [part for group in self._groups for part in (group.mean, group.root)]
         return [*each, self.predictor.offset, self.predictor.intercept, self.predictor.noise]
 
     def _frozen(self, inputs: Mapped, features: Mapped, include_noise: bool) -> list[Any]:
         """Return mean and variance with all numbers as constants."""
         ca, predictor = casadi(), self.predictor
-        own = [_frozen_group(group, *_at(group, inputs, features)) for group in predictor.groups]
+        own = [_frozen_group(group, *_at(group, inputs, features)) for group in self._groups]
         mean = self._in_order([mean for mean, _ in own]) + self._by_features(features, predictor.offset)
         variance = self._in_order([variance for _, variance in own])
         variance = variance + ca.DM(predictor.noise) if include_noise else variance
@@ -87,7 +93,7 @@ class Exported:
         ]
         own = [
             _open_group(group, *_at(group, inputs, features), *open_[2 * i : 2 * i + 2])
-            for i, group in enumerate(self.predictor.groups)
+            for i, group in enumerate(self._groups)
         ]
         offset, intercept, noise = open_[-3:]
         mean = self._in_order([mean for mean, _ in own]) + self._by_features(features, offset)

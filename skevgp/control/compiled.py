@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from ..data.rows import of_outputs
 from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
+from ..model.roots import times, transposed_times
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted
 from .derivatives import MappedRows, chained, mapped
@@ -209,16 +210,20 @@ class _Group:
     # With P = [V; Hᵀ] (m + p, n) the mean is W P and the variance s² (k̃(x, x) - |v|²) + |R P|² (`model.predictor`).
     # Their derivatives go back through P to the kernel's inputs and the features, and through the maps to X.
     own: PredictorGroup
-    product: np.ndarray  # (o + o k, m + p): W (with the offset of the weights) above the R of each output
+    product: np.ndarray  # (o + o k, m + p): W (with the offset of the weights) above the R of each output, if an array
     from_cross: np.ndarray  # (o, m): W L⁻¹, the derivative of the mean with respect to k̃(z, x)
 
     @classmethod
     def of(cls, group: PredictorGroup, offset: np.ndarray) -> _Group:
         """Prepare a group with the offset (o, p) of its weights."""
         (o, k, size), m = group.root.shape, len(group.points)
-        product = np.empty((o + o * k, size))
-        product[:o], product[o:] = group.mean, group.root.reshape(o * k, size)
+        # The root of a mixture has blocks. It is not copied.
+        is_array = isinstance(group.root, np.ndarray)
+        product = np.empty((o + o * k * is_array, size))
+        product[:o] = group.mean
         product[:o, m:] += offset
+        if is_array:
+            product[o:] = group.root.reshape(o * k, size)
         return cls(group, product, group.whitening.times_inverse_transposed(group.mean[:, :m].T).T)
 
     def moments(self, inputs: np.ndarray, features: np.ndarray, return_variance: bool) -> _Moments:
@@ -236,7 +241,7 @@ class _Group:
         if not return_variance:
             return _Moments(self.product[:o] @ P, None, prepared, P, None)
         found = self.product @ P
-        deviation = found[o:].reshape(o, k, n)
+        deviation = found[o:].reshape(o, k, n) if isinstance(group.root, np.ndarray) else times(group.root, P)
         unexplained = group.whitening.remaining(prepared, P[:m])
         variance = np.einsum("okn,okn->on", deviation, deviation) + group.signal[:, np.newaxis] * unexplained
         return _Moments(found[:o], variance, prepared, P, deviation)
@@ -252,7 +257,7 @@ class _Group:
             mean = mean + self.product[:o, m:] @ by_features
         if found.variance is None:
             return mean.transpose(1, 0, 2), None
-        P_bar = 2.0 * (group.root.transpose(0, 2, 1) @ found.deviation)  # (o, m + p, n)
+        P_bar = 2.0 * transposed_times(group.root, found.deviation)  # (o, m + p, n)
         P_bar[:, :m] -= (2.0 * group.signal)[:, np.newaxis, np.newaxis] * found.P[:m]
         U_bar = group.whitening.times_inverse_transposed(P_bar[:, :m])
         variance = U_bar.transpose(2, 0, 1) @ slopes.transpose(1, 0, 2)  # (n, o, d)

@@ -9,6 +9,7 @@ import numpy as np
 from ..data.rows import of_outputs
 from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
+from ..model.roots import times
 
 
 class MappedRows(NamedTuple):
@@ -60,7 +61,9 @@ def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
         # Where the inducing points explain a direction fully, only rounding is left, which may be negative.
         unknown = np.einsum("nii->ni", left) > 0.0
         left *= unknown[:, :, np.newaxis] & unknown[:, np.newaxis]
-        deviation = group.root[:, np.newaxis] @ P  # (o, n, k, D)
+        n, size, columns = P.shape
+        deviation = times(group.root, P.transpose(1, 0, 2).reshape(size, n * columns))
+        deviation = deviation.reshape(*deviation.shape[:2], n, columns).transpose(0, 2, 1, 3)  # (o, n, k, D)
         signal = group.signal[:, np.newaxis, np.newaxis, np.newaxis]
         parts.append(signal * left + deviation.transpose(0, 1, 3, 2) @ deviation)
     return np.moveaxis(predictor.in_order(parts), 0, 1)

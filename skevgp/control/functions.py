@@ -18,6 +18,7 @@ from ..kernels.waves import RandomFunctions, random_functions
 from ..maps import Map
 from ..model.mixture import unmixed
 from ..model.predictor import Predictor, PredictorGroup, Projected
+from ..model.roots import transposed_times
 from ..utils.shapes import like_y
 from .derivatives import MappedRows, chained, mapped
 from .near import NearPath
@@ -81,7 +82,7 @@ def drawn_weights(group: PredictorGroup, n: int, common: np.ndarray, rng: np.ran
     normals, p = rng.standard_normal((n, o, k)), common.shape[2]
     if p:
         normals[:, :, k - p :] = common
-    return group.mean + np.einsum("nok,okj->noj", normals, group.root, optimize=True)
+    return group.mean + transposed_times(group.root, normals.transpose(1, 2, 0)).transpose(2, 0, 1)
 
 
 # --- anywhere: random waves ------------------------------------------------------------------------------------------
@@ -105,12 +106,16 @@ class FunctionSamples(Sequence["SampledFunction"]):
         self._posterior = posterior
         common = common_normals(predictor, n, rng)
         self._groups: list[_Waves | _WavesOfDraws] = []
+        draw_of: np.ndarray | None = None
         for group in predictor.groups:
             draws = unmixed(group)
             if len(draws) == 1:
                 self._groups.append(_Waves.drawn(group, predictor, n, n_waves, common, rng))
             else:
-                self._groups.append(_WavesOfDraws.drawn(draws, predictor, n, n_waves, rng))
+                # All outputs of a function come from one draw, unless they are those of different models.
+                if draw_of is None or not predictor.n_common:
+                    draw_of = rng.randint(len(draws), size=n)
+                self._groups.append(_WavesOfDraws.drawn(draws, predictor, draw_of, n_waves, rng))
         self._n = n
 
     def __len__(self) -> int:
@@ -267,19 +272,27 @@ class _Waves:
 class _WavesOfDraws:
     """k functions of one output of a mixture: each comes from one of the draws of kernel and noise."""
 
-    draw_of: np.ndarray  # (k,): the draw of each function, of which about equally many have each
+    draw_of: np.ndarray  # (k,): the draw of each function
+    place: np.ndarray  # (k,): its place among the functions of this draw
     draws: list[_Waves]
 
     @classmethod
     def drawn(
-        cls, groups: list[PredictorGroup], predictor: Predictor, k: int, n_waves: int, rng: np.random.RandomState
+        cls,
+        groups: list[PredictorGroup],
+        predictor: Predictor,
+        draw_of: np.ndarray,
+        n_waves: int,
+        rng: np.random.RandomState,
     ) -> _WavesOfDraws:
-        """Draw k functions."""
-        draw_of = (rng.permutation(k) + rng.randint(len(groups))) % len(groups)
+        """Draw functions, given the draw of each."""
         draws, none = [], np.empty((0, 1, 0))
         for s, group in enumerate(groups):
             draws.append(_Waves.drawn(group, predictor, int(np.sum(draw_of == s)), n_waves, none, rng))
-        return cls(draw_of, draws)
+        place = np.empty(len(draw_of), dtype=int)
+        for s in range(len(groups)):
+            place[draw_of == s] = np.arange(np.sum(draw_of == s))
+        return cls(draw_of, place, draws)
 
     @property
     def n_waves(self) -> int:
@@ -300,9 +313,7 @@ class _WavesOfDraws:
         return self._gathered(which, lambda waves, own: waves.slopes(rows, own))
 
     def _gathered(self, which: slice, of_draw: Callable[[_Waves, Any], np.ndarray]) -> np.ndarray:
-        wanted, found = self.draw_of[which], {}
-        # The place of each function among those of its draw.
-        place = np.array([np.sum(self.draw_of[:i] == s) for i, s in enumerate(self.draw_of)], dtype=int)[which]
+        wanted, place, found = self.draw_of[which], self.place[which], {}
         for s in np.unique(wanted):
             found[s] = of_draw(self.draws[s], place[wanted == s])
         first = next(iter(found.values()))

@@ -8,7 +8,8 @@ and the same for covariances between rows (the law of total variance). A `Predic
 exactly these moments. Its f is Σ_s f_s, where the f_s are independent and have the covariances c_s s² k̃(x, x'; h_s),
 with s² = Σ s_s² / S and c_s = s_s² / (S s²). The points of draw s are about f_s. So [V; Hᵀ] has V = (√c_1 V_1, ...,
 √c_S V_S), and s² (k̃(x, x) - |V|²) is the mean of the draws' unexplained variances. The rows of the root are those of
-all draws, divided by √S, and one row (μ_s - μ) / √S for each draw.
+all draws, divided by √S, and one row (μ_s - μ) / √S for each draw. The latter rows of all outputs of a model belong to
+the same draws, which makes the outputs correlated.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from .model import SparseModel
 from .parameters import Values
 from .posterior import FittedPosterior
 from .predictor import CoefficientPrior, Predictor, PredictorGroup
+from .roots import BlockRoot
 from .statistics import Whitening
 from .weights import WeightLikelihood
 
@@ -93,7 +95,9 @@ def mixed(draws: Sequence[Predictor]) -> Predictor:
     for of_draws in zip(*(draw.groups for draw in draws), strict=True):
         outputs = np.arange(len(first.noise))[of_draws[0].outputs].tolist()
         groups += [_mixed_group(of_draws, index, output) for index, output in enumerate(outputs)]
-    return replace(first, groups=tuple(groups), noise=np.mean([draw.noise for draw in draws], axis=0))
+    # The means of all outputs move together from draw to draw.
+    noise = np.mean([draw.noise for draw in draws], axis=0)
+    return replace(first, groups=tuple(groups), noise=noise, n_theta=len(draws))
 
 
 def _mixed_group(draws: Sequence[PredictorGroup], index: int, output: int) -> PredictorGroup:
@@ -107,14 +111,15 @@ def _mixed_group(draws: Sequence[PredictorGroup], index: int, output: int) -> Pr
     means = np.array([draw.mean[index] for draw in draws])
     mean = np.concatenate([*(own[:m] / unit for own, unit in zip(means, units, strict=True)), means[:, m:].sum(axis=0)])
     mean /= n_draws
-    # All draws keep the same rows of their roots. Rows of zeros are left out.
-    used = np.any([draw.root[index].any(axis=1) for draw in draws], axis=0)
-    root = np.zeros((n_draws, used.sum() + 1, len(mean)))
-    for s, (rows, draw, unit) in enumerate(zip(root, draws, units, strict=True)):
-        of_points, own = slice(s * m, (s + 1) * m), np.vstack([draw.root[index][used], means[s]])
-        rows[:, of_points], rows[:, n_draws * m :] = own[:, :m] / unit, own[:, m:]
-        # The draw's mean less that of all draws.
-        rows[-1] -= mean
+    # Rows of zeros are left out. The last rows are the mean of each draw less that of all.
+    blocks, rows = [], np.zeros((n_draws, len(mean)))
+    for s, (draw, unit, row) in enumerate(zip(draws, units, rows, strict=True)):
+        own = draw.root[index]
+        own = own[own.any(axis=1)]
+        blocks.append(np.hstack([own[:, :m] / unit, own[:, m:]]))
+        row[s * m : (s + 1) * m], row[n_draws * m :] = means[s, :m] / unit, means[s, m:]
+        row -= mean
+    root = BlockRoot(m, tuple(blocks), rows)
     kernel, hyperparameters = draws[0].kernel, [draw.hyperparameters for draw in draws]
     return PredictorGroup(
         outputs=slice(output, output + 1),
@@ -124,7 +129,7 @@ def _mixed_group(draws: Sequence[PredictorGroup], index: int, output: int) -> Pr
         whitening=StackedWhitening(tuple(cast("Whitening", draw.whitening) for draw in draws), factors),
         signal=np.array([signal]),
         mean=mean[np.newaxis],
-        root=root.reshape(1, -1, len(mean)) / np.sqrt(n_draws),
+        root=root * (1.0 / np.sqrt(n_draws)),
     )
 
 
@@ -136,11 +141,11 @@ def unmixed(group: PredictorGroup) -> list[PredictorGroup]:
     n_draws, mixture = len(whitening.parts), group.kernel
     assert isinstance(mixture, Mixture)
     (m, d), size, groups = (len(group.points) // n_draws, group.points.shape[1]), group.mean.shape[1], []
-    points, roots = group.points.reshape(n_draws, m, d), np.sqrt(n_draws) * group.root.reshape(n_draws, -1, size)
-    of_all = zip(mixture.draws(group.hyperparameters), points, whitening.parts, roots, strict=True)
-    for s, ((c, hyperparameters), own_points, part, root) in enumerate(of_all):
+    points, root = group.points.reshape(n_draws, m, d), group.root * np.sqrt(n_draws)
+    of_all = zip(mixture.draws(group.hyperparameters), points, whitening.parts, root.blocks, root.rows, strict=True)
+    for s, ((c, hyperparameters), own_points, part, block, row) in enumerate(of_all):
         of_draw = np.r_[s * m : (s + 1) * m, n_draws * m : size]
-        own = np.vstack([root[:-1], root[-1] + group.mean])[:, of_draw]
+        own = np.vstack([block, (row + group.mean[0])[of_draw]])
         own[:, :m] *= np.sqrt(c)
         groups.append(
             PredictorGroup(

@@ -12,6 +12,7 @@ from ..data.rows import Columns, of_outputs, times_weights
 from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
 from .conditioning import Conditioned, KnownRows
 from .parameters import Values
+from .roots import BlockRoot, times
 from .statistics import Kernel
 
 
@@ -130,7 +131,7 @@ class PredictorGroup:
     # (o, m + p).
     mean: np.ndarray
     # (o, k, m + p), where k is m + p, or less in the exact model. The last p of the k rows belong to the weights.
-    root: np.ndarray
+    root: Any
     # (o, p, m): if f is orthogonal to the features, the weights of the best fit are those of ``mean`` and ``root`` plus
     # this times the numbers of f. None: they are those of ``mean`` and ``root``.
     leak: np.ndarray | None = None
@@ -184,6 +185,8 @@ class PredictorGroup:
     def weight_roots(self) -> np.ndarray:
         """Roots (o, k, p) of the covariance of the weights. They are those of the best fit if f is orthogonal."""
         m = len(self.points)
+        if isinstance(self.root, BlockRoot):
+            return self.root.of_weights()
         roots = self.root[:, :, m:]
         return roots if self.leak is None else roots + np.einsum("okm,opm->okp", self.root[:, :, :m], self.leak)
 
@@ -216,7 +219,8 @@ class Predictor:
     intercept: np.ndarray
     # Whether outputs share their weights and are therefore correlated.
     shared: bool
-    # Number of parameters θ of the features that outputs with own weights share. The last rows of all roots are theirs.
+    # Number of rows at the end of the roots that belong to the same numbers for all outputs with own weights: parameters
+    # θ of the features, or the draws of a mixture.
     n_theta: int = 0
 
     @property
@@ -267,7 +271,9 @@ class Predictor:
                 mean, root = group.mean * by, group.root * by[:, np.newaxis]
                 near = None if group.near is None else group.near.scaled(float(by[0, 0]))
                 groups.append(replace(group, outputs=columns_of_group, signal=signal, mean=mean, root=root, near=near))
-        return cls(tuple(groups), noise, offset, intercept, parts[0].shared)
+        # Only the draws of one model are the same for all outputs.
+        n_shared = parts[0].n_theta if len(parts) == 1 else 0
+        return cls(tuple(groups), noise, offset, intercept, parts[0].shared, n_shared)
 
     @property
     def rows_at_once(self) -> int:
@@ -297,10 +303,9 @@ class Predictor:
         for group, rows in zip(self.groups, self.projected(inputs, features), strict=True):
             means.append(group.mean @ rows.P + rows.from_near)
             if return_variance:
-                o, k, size = group.root.shape
-                deviation = group.root.reshape(o * k, size) @ rows.P
+                deviation = times(group.root, rows.P)
                 np.multiply(deviation, deviation, out=deviation)
-                squares = deviation.reshape(o, k, len(features)).sum(axis=1)
+                squares = deviation.sum(axis=1)
                 variances.append(np.outer(group.signal, rows.unexplained) + squares)
         mean = self.in_order(means).T
         mean += times_weights(features, self.offset)
@@ -365,8 +370,10 @@ class Predictor:
             prior = diagonal_of(K)
             unexplained = K - V.T @ V if group.near is None else group.near.covariance(rows.inputs)
             matrices, terms = np.empty((len(group.signal), n, n)), np.empty((len(group.signal), n))
-            for matrix, sizes_of_output, signal, root in zip(matrices, terms, group.signal, group.root, strict=True):
-                deviation = root[: len(root) - p] @ rows.P
+            deviations = times(group.root, rows.P)
+            deviations = deviations[:, : deviations.shape[1] - p]
+            each = zip(matrices, terms, group.signal, deviations, strict=True)
+            for matrix, sizes_of_output, signal, deviation in each:
                 matrix[...] = signal * unexplained + deviation.T @ deviation
                 sizes_of_output[...] = signal * prior + np.square(deviation).sum(axis=0)
             covariances[group.outputs], sizes[group.outputs] = matrices, terms
@@ -382,7 +389,8 @@ class Predictor:
         for group, rows in zip(self.groups, self.projected(inputs, features), strict=True):
             V = rows.P[: len(group.points)]
             left = np.outer(group.signal, rows.unexplained)
-            left += np.square(group.root[:, :, : len(V)] @ V).sum(axis=1)
+            of_points = np.concatenate([V, np.zeros((len(rows.P) - len(V), V.shape[1]))])
+            left += np.square(times(group.root, of_points)).sum(axis=1)
             prior = np.outer(group.signal, group.whitening.covariance.diagonal(rows.prepared) * np.ones(len(features)))
             # A linear kernel has no variance at the origin.
             parts.append(np.minimum(left / np.where(prior > 0.0, prior, np.inf), 1.0))
@@ -398,7 +406,9 @@ class Predictor:
         # independent.
         p = self.n_common
         return self.in_order(
-            group.root[:, group.root.shape[1] - p :] @ rows.P
+            times(group.root, rows.P)[:, group.root.shape[1] - p :]
+            if p
+            else np.empty((len(group.signal), 0, rows.P.shape[1]))
             for group, rows in zip(self.groups, projected, strict=True)
         )
 
