@@ -12,7 +12,7 @@ from ..data.rows import Columns, of_outputs, times_weights
 from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
 from .conditioning import Conditioned, KnownRows
 from .parameters import Values
-from .roots import BlockRoot, times
+from .roots import BlockRoot, last_rows, times
 from .statistics import Kernel
 
 
@@ -219,8 +219,8 @@ class Predictor:
     intercept: np.ndarray
     # Whether outputs share their weights and are therefore correlated.
     shared: bool
-    # Number of rows at the end of the roots that belong to the same numbers for all outputs with own weights: parameters
-    # θ of the features, or the draws of a mixture.
+    # Number of rows at the end of the roots that belong to the same numbers for all outputs with own weights: those of
+    # parameters θ of the features, or of the draws of a mixture.
     n_theta: int = 0
 
     @property
@@ -406,10 +406,7 @@ class Predictor:
         # independent.
         p = self.n_common
         return self.in_order(
-            times(group.root, rows.P)[:, group.root.shape[1] - p :]
-            if p
-            else np.empty((len(group.signal), 0, rows.P.shape[1]))
-            for group, rows in zip(self.groups, projected, strict=True)
+            times(last_rows(group.root, p), rows.P) for group, rows in zip(self.groups, projected, strict=True)
         )
 
     def jointly(self, covariance: np.ndarray, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:

@@ -77,3 +77,10 @@ def transposed_times(root: np.ndarray | BlockRoot, D: np.ndarray) -> np.ndarray:
 def dense(root: np.ndarray | BlockRoot) -> np.ndarray:
     """The roots as one array (o, k, m + p)."""
     return root.dense() if isinstance(root, BlockRoot) else root
+
+
+def last_rows(root: np.ndarray | BlockRoot, p: int) -> np.ndarray:
+    """The last p rows of roots as an array (o, p, m + p). Those of a mixture are none, or those of all draws."""
+    if isinstance(root, BlockRoot):
+        return root.rows[np.newaxis, len(root.rows) - p :]
+    return root[:, root.shape[1] - p :]

@@ -63,6 +63,20 @@ def test_moments_are_those_of_all_draws(model, draws):
     assert_allclose(covariance, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
+def test_outputs_move_together_from_draw_to_draw(model, draws):
+    rows = rows_of(model, X_NEW)
+    means = np.array([draw.predict(*rows)[0] for draw in draws])
+    apart = means - means.mean(axis=0)
+    between = np.einsum("sni,smj->nimj", apart, apart) / len(draws)
+    _, joint = model.predict(X_NEW, return_cov="joint")
+    found = joint.reshape(len(X_NEW), O, len(X_NEW), O)
+    # Outputs of different models have their own draws.
+    expected = between[:, 0, :, 1] if len(model._fitted.models) == 1 else 0.0
+    assert_allclose(found[:, 0, :, 1], expected, rtol=1e-7, atol=1e-9 * np.abs(joint).max())
+    _, own = model.predict(X_NEW, return_cov=True)
+    assert_allclose(found[:, 0, :, 0], own[..., 0], rtol=1e-9, atol=1e-12)
+
+
 def test_weights_are_those_of_all_draws(model, draws):
     if model.feature_map_ is None:
         return
