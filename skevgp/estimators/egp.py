@@ -108,15 +108,15 @@ class EGPRegressor(GaussianProcess):
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     kernel_ : Kernel, or list of Kernel for several outputs
-        Fitted kernel without noise.
+        Fitted kernel without noise. With few rows, it is the most likely one (see :doc:`/guide/few_rows`).
     noise_variance_ : float or ndarray of shape (n_outputs,)
-        Noise variance σ² in squared units of y.
+        Noise variance σ² in squared units of y. With few rows, it is the mean over the kernels that are averaged.
     log_marginal_likelihood_value_ : float
         Log marginal likelihood in nats, summed over outputs. With a vague prior of the weights, it is eq. 2.45 of
         Rasmussen & Williams (2006).
     loss_curve_ : ndarray of shape (n_iter,)
         Minus the sum of the log marginal likelihood and the log prior density of learned scales of weights, per
-        iteration.
+        iteration. With few rows, kernel and noise have a prior too.
     n_iter_ : int
         Number of iterations of the best start.
     n_features_in_ : int

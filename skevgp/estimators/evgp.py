@@ -133,9 +133,9 @@ class EVGPRegressor(GaussianProcess):
     sharing_ : list of list of int
         Groups of outputs that share a kernel.
     kernel_ : Kernel, or list of Kernel for several outputs
-        Fitted kernel without noise.
+        Fitted kernel without noise. With few rows, it is the most likely one (see :doc:`/guide/few_rows`).
     noise_variance_ : float or ndarray of shape (n_outputs,)
-        Noise variance σ² in squared units of y.
+        Noise variance σ² in squared units of y. With few rows, it is the mean over the kernels that are averaged.
     weights_ : ndarray of shape (n_samples,) or (n_samples, n_outputs)
         Factor on the precision of each row: 1 for ordinary rows, and near 0 for outliers. It exists only with
         ``noise="student-t"``.
@@ -144,7 +144,8 @@ class EVGPRegressor(GaussianProcess):
         noise. If they agree, more inducing points do not help this kernel. With ``n_neighbors``, the first is the log
         likelihood of the approximation, which is no bound, and the second is inf.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the lower bound per iteration. With ``n_neighbors``, that of the sparse fit which comes first.
+        Minus the lower bound per iteration. With ``n_neighbors``, that of the sparse fit which comes first. With few
+        rows, minus the sum of the bound and the log prior of kernel and noise.
     n_iter_ : int
         Number of iterations of the best start.
     n_parameters_ : int

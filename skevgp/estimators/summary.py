@@ -323,7 +323,7 @@ def _advice(model: Any) -> str:
     n_rows, n_numbers = few
     then = f"predictions are averaged over {n_draws} draws of these" if n_draws else "std may be too small"
     said = f"{n_rows} rows are few for {n_numbers} numbers of kernel and noise: {then}"
-    if n_numbers < n_rows:
+    if n_numbers < n_rows or len(_kernel_columns(model)) < 2:
         return said
     return f"{said}. A kernel with one length scale, such as RBF(1.0), or fewer columns may predict better"
 

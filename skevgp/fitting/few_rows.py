@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..kernels.base import Covariance
 from ..model.parameters import ParameterTable, Values
 from ..solvers.base import Limits, Objective
 from ..utils.linalg import NotPositiveDefiniteError
@@ -28,8 +29,8 @@ _SIGNAL_STD, _NOISE_STD, _OTHER_STD, _NOISE_SHARE = 4.0, 2.0, 2.0, 0.1
 _LONG, _SHORT, _NOISE, _GAIN, _TRIED, _CHOSEN = 3.0, 1.0, 0.3, 1.0, 40, 8
 # Modes are different if a coordinate differs by more than this.
 _SAME = 0.2
-# Share of the difference between the log evidences of two modes that counts: it is only known from the curvature along
-# the axes.
+# This share of the difference between the log evidences of two modes counts. The evidence is only known from the
+# curvature along the axes.
 _EVIDENCE = 0.5
 # Hamiltonian Monte Carlo: draws, trajectories for each draw, trajectories before the first draw, steps of a
 # trajectory, and the first length of a step in posterior standard deviations.
@@ -57,24 +58,25 @@ class HyperPrior:
 
     @classmethod
     def of(
-        cls, table: ParameterTable, mask: np.ndarray, column_std: np.ndarray, scatter: np.ndarray, weight: float
+        cls, table: ParameterTable, kernel: Covariance, column_std: np.ndarray, scatter: np.ndarray, weight: float
     ) -> HyperPrior:
         """The prior of the parameters of a table.
 
-        ``mask`` (n_hyper,) says which hyperparameters are length scales of the columns, whose standard deviations are
-        ``column_std`` (d,). ``scatter`` (o,) is the variance of the residuals.
+        ``column_std`` (d,) are the standard deviations of the columns. ``scatter`` (o,) is the variance of the
+        residuals. It is 0 for constants, whose noise variance has its start as median.
         """
-        d, starts = len(column_std), {name: table[name].start for name in ("hyperparameters", "signal", "noise")}
-        means = {name: np.log(start) for name, start in starts.items()} | {"noise": np.log(_NOISE_SHARE * scatter)}
+        starts = {name: table[name].start for name in ("hyperparameters", "signal", "noise")}
+        medians = starts | {"noise": np.where(scatter > 0.0, _NOISE_SHARE * scatter, starts["noise"])}
+        means = {name: np.log(median) for name, median in medians.items()}
         spreads = {"hyperparameters": _OTHER_STD, "signal": _SIGNAL_STD, "noise": _NOISE_STD}
         stds = {name: np.full(start.shape, spreads[name]) for name, start in starts.items()}
-        length = _LENGTH_MEAN + 0.5 * np.log(d) + np.log(column_std)
-        columns = mask if mask.sum() == d and starts["hyperparameters"].ndim == 1 else None
-        if columns is not None:
-            means["hyperparameters"][columns], stds["hyperparameters"][columns] = length, _LENGTH_STD
-        elif len(mask) == 1:
-            means["hyperparameters"][...], stds["hyperparameters"][...] = length.mean(), _LENGTH_STD
-        return cls(weight, means, stds, columns)
+        # A length scale of all columns is in units of their mean standard deviation (of logarithms).
+        d, of_column, is_length = len(column_std), kernel.lengthscale_mask, kernel.is_length
+        lengths = _LENGTH_MEAN + 0.5 * np.log(d) + np.log(column_std)
+        means["hyperparameters"][..., is_length & ~of_column] = lengths.mean()
+        means["hyperparameters"][..., of_column] = np.resize(lengths, of_column.sum())
+        stds["hyperparameters"][..., is_length] = _LENGTH_STD
+        return cls(weight, means, stds, of_column if of_column.sum() == d else None)
 
     def log_density(self, values: Values) -> float:
         """The log density, times the weight and without its constant."""
@@ -109,23 +111,31 @@ class WithPrior:
 # --- a start ----------------------------------------------------------------------------------------------------------
 
 
-def forward_selection(energy: Objective, table: ParameterTable, prior: HyperPrior, scatter: np.ndarray) -> Values:
+def forward_selection(
+    energy: Objective, table: ParameterTable, prior: HyperPrior, scatter: np.ndarray, seen: Callable[[float], None]
+) -> Values:
     """Values in which a few columns have short length scales: one after another, the one that lowers the energy most.
 
     With about as many columns as rows, a gradient leads to many columns that matter a little. ``energy`` is a function
-    of the flat vector of the table, and ``prior.columns`` is not None.
+    of the flat vector of the table, and ``prior.columns`` is not None. ``seen`` is called with each energy.
     """
     assert prior.columns is not None
-    values, place = table.values_at_start(), np.flatnonzero(prior.columns)
+    values, is_free = table.values_at_start(), table["hyperparameters"].free
+    place = np.flatnonzero(prior.columns & is_free)
     means = {name: np.exp(mean) for name, mean in prior.means.items()}
     hyperparameters = np.where(prior.columns, _LONG * means["hyperparameters"], values["hyperparameters"])
-    short = _SHORT * means["hyperparameters"] / np.exp(_LENGTH_MEAN + 0.5 * np.log(len(place)))
-    values |= {"hyperparameters": hyperparameters, "signal": means["signal"], "noise": _NOISE * scatter}
+    short = _SHORT * means["hyperparameters"] / np.exp(_LENGTH_MEAN + 0.5 * np.log(prior.columns.sum()))
+    values |= {"hyperparameters": hyperparameters, "signal": means["signal"]}
+    values["noise"] = np.where(scatter > 0.0, _NOISE * scatter, values["noise"])
 
     def at(hyperparameters: np.ndarray) -> tuple[float, np.ndarray]:
         start = table.started_at(values | {"hyperparameters": hyperparameters}).start()
         value, slope = _at(energy, start)
-        return value, table.coordinates(slope)["hyperparameters"]
+        seen(value)
+        # The free hyperparameters are the first coordinates.
+        slopes = np.zeros(len(is_free))
+        slopes[is_free] = slope[: is_free.sum()]
+        return value, slopes
 
     best, slope = at(hyperparameters)
     chosen: list[int] = []
@@ -158,9 +168,10 @@ def drawn(
     ``energy`` returns its value and gradient. ``limits`` reflect the chains. ``seen`` is called with the energy after
     each trajectory.
     """
-    # Each mode has draws by its share of the evidence, ∫ exp(-energy) ≈ exp(-energy) Π unit around it.
+    # Each mode has draws by its share of the evidence, ∫ exp(-energy) ≈ exp(-energy) Π unit around it. Of modes close
+    # to each other, the best counts.
     different: list[np.ndarray] = []
-    for mode in modes:
+    for mode in sorted(modes, key=lambda mode: _at(energy, mode)[0]):
         if all(np.abs(mode - other).max(initial=0.0) > _SAME for other in different):
             different.append(mode)
     units = [_units(energy, np.round(mode / _START_GRID) * _START_GRID, rng) for mode in different]
@@ -184,7 +195,7 @@ def _chain(
     seen: Callable[[float], None],
 ) -> list[np.ndarray]:
     """Draws by Hamiltonian Monte Carlo (Neal 2011) from a mode, with momenta in units of the coordinates."""
-    x = _on_grid(np.clip(mode, *limits), unit)
+    x = np.clip(_on_grid(mode, unit), *limits)
     (here, slope), step, draws = _at(energy, x), _STEP, list[np.ndarray]()
     for turn in range(_WARM_UP + _PER_DRAW * n_draws):
         momentum, uniform, length = rng.standard_normal(len(x)), rng.uniform(), rng.uniform(0.4, 1.2)

@@ -122,7 +122,7 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
 
 def _few(model: Model) -> tuple[int, int] | None:
     """The numbers of rows and of learned numbers of kernel and noise, if the rows are few for these."""
-    return (round(model.rows.total), model.n_learned) if model.has_few_rows else None
+    return (len(model.rows), model.n_learned) if model.has_few_rows else None
 
 
 def _averaged(model: Model, fit: Fit, posterior: FittedPosterior) -> FittedPosterior:

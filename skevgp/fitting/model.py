@@ -104,7 +104,7 @@ class Model:
         """Sizes of the samples that the fit begins with."""
         (o, p), (g, _, d) = self.sparse.prior.scale.shape, self.table["inducing_points"].start.shape
         width = d + p + o if self.sparse.kernels is None else g * (d + p) + o
-        if self.is_exact and self.problem.solver.takes_any_objective:
+        if self.is_exact and self.problem.solver.takes_any_objective and not self.has_few_rows:
             return replace(self.rules, sample=self.rules.exact_sample).samples(
                 len(self.rows), self.n_learned + p, width
             )
@@ -186,22 +186,30 @@ class Model:
         )
         if unsupported or not self.has_few_rows or not table["hyperparameters"].free.any():
             return None
-        if self.rows.is_constant().any():
+        if self.rows.is_constant().all():
             return None
         weight = np.sqrt(1.0 - self.rows.total / (self.rules.few_rows * self.n_learned))
-        return few_rows.HyperPrior.of(table, self.lengthscale_mask, self.rows.inputs.scale, self.scatter, weight)
+        scatter = np.where(self.rows.is_constant(), 0.0, self.scatter)
+        return few_rows.HyperPrior.of(table, problem.spec.covariance, self.rows.inputs.scale, scatter, weight)
 
     def log_hyper_prior(self, values: Values) -> float:
         """The log prior density of kernel and noise, which the objective has."""
         return 0.0 if self.hyper_prior is None else self.hyper_prior.log_density(values)
 
     def by_forward_selection(self) -> Values | None:
-        """The start of `few_rows.forward_selection`. None if rows are not few, or if there are not several columns."""
+        """The start of `few_rows.forward_selection`. None if rows are not few, or if there are not several columns.
+
+        Raises KeyboardInterrupt if the fit is to end.
+        """
         prior = self.hyper_prior
         if prior is None or prior.columns is None or prior.columns.sum() < 2:
             return None
         table = self.table.changed("inducing_points", fixed=True)
-        chosen = few_rows.forward_selection(self._energy(table), table, prior, self.scatter)
+        seen, scatter = (
+            partial(self.monitor.silent().iteration, 0),
+            np.where(self.rows.is_constant(), 0.0, self.scatter),
+        )
+        chosen = few_rows.forward_selection(self._energy(table), table, prior, scatter, seen)
         return {name: chosen[name] for name in prior.means}
 
     def draws(self, fit: Fit) -> list[Values]:
@@ -213,9 +221,10 @@ class Model:
         medians = {name: np.exp(mean) for name, mean in self.hyper_prior.means.items()}
         energy, origin = self._energy(table), table.started_at(medians).start()
         modes: list[np.ndarray] = []
+        most = min(_MODE_ITER, self.max_iter)
         for values in fit.others or (fit.values,):
             start, curvature = np.clip(table.started_at(values).start(), *limits), (objective, table.alike())
-            modes.append(LBFGS().minimise(objective, start, limits, _MODE_ITER, tolerance, monitor, curvature).x)
+            modes.append(LBFGS().minimise(objective, start, limits, most, tolerance, monitor, curvature).x)
         found: list[np.ndarray] = []
         with monitor.keeping_the_best():
             rng, seen = np.random.RandomState(0), partial(monitor.iteration, 0)

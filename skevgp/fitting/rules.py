@@ -68,7 +68,7 @@ class Rules:
     longest: float = 3.0
     # With fewer rows than this for each free number of kernel, signal and noise, these have a prior, whose weight falls
     # from 1 to 0 at so many rows, and predictions are averaged over draws of them (see `few_rows`). 0: never.
-    few_rows: float = 0.0
+    few_rows: float = 12.0
     # A restart multiplies the first values by random numbers between 1 / factor and the factor, log-uniformly.
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
@@ -93,7 +93,6 @@ RULES = Rules(
     stage=25,
     sample=(1000, 20),
     exact_sample=(250, 12),
-    few_rows=12.0,
 )
 MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 

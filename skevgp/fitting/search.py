@@ -155,7 +155,8 @@ class Search:
         free, everything = bool(self.table["noise"].free.any()), n_rows is None
         much = self.rules.much_noise if free and (self.model.interpolates or not everything) else None
         best = self._fit(Start(values, until, None, n_rows, cold=True))
-        selected = self.model.by_forward_selection() if everything and until > 0 else None
+        # The start does not depend on the values: restarts do not repeat it.
+        selected = self.model.by_forward_selection() if everything and until > 0 and len(self.ends) == 1 else None
         if selected is not None:
             best = better(best, self._fit(Start(values | selected, until, None, cold=True)))
         if until == 0 or not free:

@@ -194,6 +194,11 @@ class Covariance(ABC):
         return np.zeros(self.n_hyperparameters, dtype=bool)
 
     @property
+    def is_length(self) -> np.ndarray:
+        """Whether each hyperparameter is a length scale, of one column or of all, (n_hyper,)."""
+        return self.lengthscale_mask
+
+    @property
     @abstractmethod
     def rows(self) -> Preparation:
         """Function that prepares rows once; parts of a sum or product share it if theirs are equal."""
@@ -271,6 +276,10 @@ class _Combination(Covariance):
     @property
     def lengthscale_mask(self) -> np.ndarray:
         return np.concatenate([part.lengthscale_mask for part in self.parts])
+
+    @property
+    def is_length(self) -> np.ndarray:
+        return np.concatenate([part.is_length for part in self.parts])
 
     @property
     def preparations(self) -> tuple[Preparation, ...]:

@@ -23,6 +23,7 @@ class ExpSineSquared(Profile):
 
     n_parameters = 1
     has_root = True
+    scale_is_length = False  # but the period
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         return np.exp(-2.0 * self._squared(np.sqrt(-2.0 * E), parameters))

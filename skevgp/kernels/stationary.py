@@ -63,6 +63,8 @@ class Profile(ABC):
     n_parameters: ClassVar[int] = 0
     # Whether φ takes the root of r², which then needs all its digits.
     has_root: ClassVar[bool] = False
+    # Whether distances are in units of length scales.
+    scale_is_length: ClassVar[bool] = True
 
     @property
     def smooth(self) -> bool:
@@ -325,6 +327,11 @@ class Stationary(Covariance):
     def lengthscale_mask(self) -> np.ndarray:
         is_length = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
         return is_length & (not self.isotropic)
+
+    @property
+    def is_length(self) -> np.ndarray:
+        after_parameters = np.arange(self.n_hyperparameters) >= self.profile.n_parameters
+        return after_parameters & self.profile.scale_is_length
 
     def centred(self, centre: np.ndarray) -> Stationary:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))

@@ -41,7 +41,8 @@ class LBFGS(Solver):
         kept. Inducing points that ``inducing_init`` gives stay the same.
     callback : callable, default=None
         Function ``callback(iteration, lower_bound, outputs)``, called once per iteration. ``outputs`` are the columns
-        of y that the bound belongs to. Raise StopIteration to end the fit with the best parameters so far.
+        of y that the bound belongs to. Raise StopIteration to end the fit with the best parameters so far. With few
+        rows, the log prior of kernel and noise is added to the bound. See :doc:`/guide/few_rows`.
 
     posterior : {"full", "diagonal"}, default="full"
         Covariance of the approximate posterior q. If ``"full"``, q is one joint Gaussian of inducing values and
@@ -54,7 +55,8 @@ class LBFGS(Solver):
         a restart gains no more. If ``"auto"``, 0.0015 % of the gain over features and noise alone, and at least 0.01.
     max_time : float, default=None
         Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
-        calibration by ``noise_cv`` is skipped. If None, there is no limit.
+        calibration by ``noise_cv`` is skipped, as is the average over kernels of a fit to few rows. If None, there is
+        no limit.
     max_inducing : int, default=1000
         Maximum number of inducing points of ``n_inducing="auto"``.
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import lognorm
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, ExpSineSquared, Matern, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -82,6 +82,21 @@ def test_there_is_no_prior_where_nothing_is_learned_or_a_solver_takes_none(chang
     assert few(**changes).hyper_prior is None
 
 
+def test_lengths_are_those_of_the_kernel_also_beside_a_constant_output():
+    """A kernel says which numbers are lengths. A constant output does not switch the prior off."""
+    X, y = waves(20, 2)
+    kernel = RBF(1.0) * Matern(1.0) + RBF([1.0, 1.0]) + DotProduct(0.7) + ConstantKernel(0.1) * ExpSineSquared(0.6, 1.1)
+    prior = model_of(**data_of(y[:, np.newaxis], X), kernel=kernel).hyper_prior
+    length = np.exp(few_rows._LENGTH_MEAN) * np.sqrt(2) * X.std(axis=0)
+    both = np.sqrt(length.prod())
+    expected = [both, both, *length, 0.7, 0.1, 0.6, 1.1]
+    np.testing.assert_allclose(np.exp(prior.means["hyperparameters"]), expected)
+    np.testing.assert_array_equal(prior.stds["hyperparameters"] == few_rows._LENGTH_STD, [True] * 4 + [False] * 4)
+    model = EGPRegressor().fit(X, np.column_stack([y, np.zeros(20)]))
+    assert model._fitted.n_draws == few_rows.N_DRAWS
+    assert model.predict(X, return_std=True)[1][:, 1].max() < 1e-3
+
+
 # --- the start --------------------------------------------------------------------------------------------------------
 
 
@@ -90,7 +105,9 @@ def test_forward_selection_finds_the_columns_that_matter(seed):
     X, y = waves(50, 35, seed)
     model = model_of(**data_of(y[:, np.newaxis], X), n_inducing=50)
     table = model.table.changed("inducing_points", fixed=True)
-    chosen = forward_selection(model._energy(table), table, model.hyper_prior, model.scatter)
+    energies = []
+    chosen = forward_selection(model._energy(table), table, model.hyper_prior, model.scatter, energies.append)
+    assert len(energies) <= 1 + 8 * 35
     assert set(np.argsort(chosen["hyperparameters"])[:2]) == {0, 1}
 
 
@@ -200,3 +217,5 @@ def test_summary_says_that_rows_are_few_and_for_what():
     assert "12 rows are few for 17 numbers of kernel and noise: predictions are averaged over 16 draws" in said
     assert "A kernel with one length scale" in said
     assert "few" not in str(EVGPRegressor(random_state=0, kernel=RBF(1.0)).fit(*waves(40, 15)).summary())
+    said = EVGPRegressor(random_state=0, noise="student-t").fit(X, y).summary().advice
+    assert "std may be too small" in said
