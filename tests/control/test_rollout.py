@@ -33,9 +33,10 @@ def plant(z, u):
 
 @pytest.fixture(scope="module")
 def data():
+    # With fewer rows, outputs share the draws of their kernel, and are a little correlated.
     rng = np.random.RandomState(0)
-    z, u = rng.uniform(-2.0, 2.0, (80, 2)), rng.uniform(-1.0, 1.0, (80, 1))
-    return np.hstack([z, u]), plant(z, u) + 0.02 * rng.randn(80, 2)
+    z, u = rng.uniform(-2.0, 2.0, (90, 2)), rng.uniform(-1.0, 1.0, (90, 1))
+    return np.hstack([z, u]), plant(z, u) + 0.02 * rng.randn(90, 2)
 
 
 @pytest.fixture(scope="module")
