@@ -57,7 +57,8 @@ class Functions:
 
     def at_once(self, n_steps: int) -> int:
         """Number of paths to follow at once, so that memory stays small."""
-        points = sum(len(group.points) for group in self.predictor.groups)
+        # A path of a mixture has the points of one draw.
+        points = sum(len(group.points) // len(unmixed(group)) for group in self.predictor.groups)
         return max(1, _NUMBERS_OF_PATHS // (n_steps * (n_steps * len(self.predictor.groups) + points)))
 
     def draw(self, n: int, n_steps: int, rng: np.random.RandomState) -> Callable[[np.ndarray], np.ndarray]:
@@ -337,12 +338,35 @@ class Paths:
         # Groups with a local part condition their rows themselves.
         self.predictor = replace(predictor, groups=tuple(replace(group, near=None) for group in predictor.groups))
         common = common_normals(predictor, n, rng)
-        self._groups = [_path_of(group, n, n_steps, common, rng) for group in predictor.groups]
+        self._groups: list[_Path | _PathOfDraws | NearPath] = []
+        draw_of: np.ndarray | None = None
+        for group in predictor.groups:
+            draws = unmixed(group)
+            if len(draws) == 1:
+                self._groups.append(_path_of(group, n, n_steps, common, rng))
+                continue
+            # As in `FunctionSamples`.
+            if draw_of is None or not predictor.n_common:
+                draw_of = rng.randint(len(draws), size=n)
+            self._groups.append(_PathOfDraws(draws, draw_of, n_steps, rng))
 
     def step(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Return the noise-free g(x) of each function at its row, (n, o), from inputs (n, d) and features (n, p)."""
-        projected = self.predictor.projected(inputs, features)
-        parts = [own.step(rows).T for own, rows in zip(self._groups, projected, strict=True)]
+        plain = replace(
+            self.predictor,
+            groups=tuple(
+                group
+                for group, own in zip(self.predictor.groups, self._groups, strict=True)
+                if not isinstance(own, _PathOfDraws)
+            ),
+        )
+        projected, parts = plain.projected(inputs, features), []
+        for group, own in zip(self.predictor.groups, self._groups, strict=True):
+            if isinstance(own, _PathOfDraws):
+                rows = of_outputs(inputs, group.outputs), of_outputs(features, group.outputs)
+                parts.append(own.step(*rows).T)
+            else:
+                parts.append(own.step(next(projected)).T)
         values = self.predictor.in_order(parts).T
         return values + times_weights(features, self.predictor.offset) + self.predictor.intercept
 
@@ -390,6 +414,29 @@ class _Path:
         self._V[:, t], self._inputs[:, t] = V, rows.inputs
         self._t = t + 1
         return values + np.sqrt(group.signal) * residual
+
+
+class _PathOfDraws:
+    """The part of n functions that belongs to one output of a mixture: each comes from one of the draws."""
+
+    def __init__(self, draws: list[PredictorGroup], draw_of: np.ndarray, n_steps: int, rng: np.random.RandomState):
+        none, self._parts = np.empty((0, 1, 0)), list[tuple[np.ndarray, _Path]]()
+        for s, group in enumerate(draws):
+            which = np.flatnonzero(draw_of == s)
+            if len(which):
+                self._parts.append((which, _Path(group, len(which), n_steps, none, rng)))
+
+    def step(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Return f + P weights of each function at its own row, (n, 1)."""
+        found = np.empty((len(inputs), 1))
+        for which, path in self._parts:
+            group, own = path.group, inputs[which]
+            prepared, m = group.kernel.prepare(own), len(group.points)
+            P = np.empty((group.mean.shape[1], len(which)))
+            P[m:] = features[which].T
+            V = group.whitening.solve(prepared, out=P[:m])
+            found[which] = path.step(Projected(own, prepared, P, group.whitening.remaining(prepared, V)))
+        return found
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
