@@ -184,6 +184,7 @@ RULES_OFF = {
         "sparse",
     ),
     "sample": Rule("a fit begins on a sample", (field(sample=None),), "many"),
+    "exact-sample": Rule("an exact fit begins on a sample", (field(exact_sample=None),), "many"),
     "sample-again": Rule(
         "a fit that collapsed on a sample starts again",
         (

@@ -39,6 +39,7 @@ PAGES = {
     "scaling": ("speed", lambda own, rows: own.PARTS["rows"][3](rows)),
     "many_rows": ("speed", lambda own, rows: own.PARTS["million"][3](rows)),
     "few_rows": ("few_rows", lambda own, rows: own.tables(rows)),
+    "exact_fits": ("speed", lambda own, rows: own.PARTS["exact"][3](rows)),
     "tabular": ("tables", lambda own, rows: own.tables_of_models(rows)),
     "auto_inducing": ("tables", lambda own, rows: own.tables_of_inducing(rows)),
     "rollouts": ("control", lambda own, rows: own.rollout_tables(rows)),

@@ -1,15 +1,20 @@
 """The exact model's fit: units of its likelihood, where it starts, what it refuses and says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+from skevgp.fitting import rules
 from skevgp.fitting.fit import fit_model
 from skevgp.fitting.inducing import Placement
+from skevgp.fitting.search import search
+from skevgp.model.exact import ExactModel, LikelihoodObjective
 from skevgp.solvers import LBFGS
 from skevgp.utils.monitor import Monitor
 
-from .cases import H, N, Y, problem_of, units_of
+from .cases import H, N, Y, models, problem_of, units_of
 
 KERNEL = ConstantKernel(1.4, (0.1, 200.0)) * RBF([0.9, 1.6], [(0.1, 9.0), (0.2, 8.0)]) + WhiteKernel(0.2)
 
@@ -50,3 +55,24 @@ def test_y_far_from_its_prior_mean_is_told_but_a_vague_weight_has_none():
     far = Y + 1e3
     assert any("prior standard deviations away" in message for message in fitted(Y=far, max_iter=50).messages)
     assert not any("prior" in message for message in fitted(Y=far, max_iter=50, vague=True).messages)
+
+
+def test_fit_that_begins_on_a_sample_ends_at_the_likelihood_of_all_rows(monkeypatch):
+    """A sample's objective is the likelihood of its rows. The fit to all rows ends as high as one without a sample."""
+    monkeypatch.setattr(rules, "RULES", replace(rules.RULES, few_rows=0.0))
+    (model,) = models(kernel=KERNEL, placement=Placement("all rows", 0), max_iter=200, tol=0.01)
+    assert model.is_exact
+    assert model.samples == ()
+    plain = search(model)
+    monkeypatch.setattr(rules, "RULES", replace(rules.RULES, exact_sample=(25, 1)))
+    (model,) = models(kernel=KERNEL, placement=Placement("all rows", 0), max_iter=200, tol=0.01)
+    assert model.samples == (25,)
+    sample = model._sample.some(np.arange(25))
+    expected = LikelihoodObjective(ExactModel.of(model.sparse, model.vague, sample), model.table)
+    x = model.table.start()
+    for found, wanted in zip(model.objective(model.table, 25)(x), expected(x), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+    fit = search(model)
+    assert fit.n_rows is None
+    assert fit.bound > plain.bound - 0.05
+    assert fit.bound == pytest.approx(model.exact.log_likelihoods(fit.values).sum(), rel=1e-9)
