@@ -117,7 +117,8 @@ class Model:
 
     @cached_property
     def _sample(self) -> Rows:
-        return self.rows.random_subset(self.samples[-1], self.rng)
+        # An exact fit without restarts does not depend on the seed.
+        return self.rows.random_subset(self.samples[-1], np.random.RandomState(0) if self.is_exact else self.rng)
 
     @cached_property
     def blocks(self) -> Blocks:

@@ -92,7 +92,7 @@ RULES = Rules(
     much_noise=1e3,
     stage=25,
     sample=(1000, 20),
-    exact_sample=(250, 12),
+    exact_sample=(500, 25),
 )
 MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 
