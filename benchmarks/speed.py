@@ -7,7 +7,7 @@
     python benchmarks/speed.py rows        # time and memory up to a million rows, files and Dask: 5 minutes
     python benchmarks/speed.py million     # a million rows to the end, by L-BFGS and Adam: minutes of two cores
     python benchmarks/speed.py million --fits reference    # a thousand iterations: much longer
-    python benchmarks/speed.py exact       # EGPRegressor and scikit-learn's GPR, up to 2,000 rows: an hour
+    python benchmarks/speed.py exact       # EGPRegressor and scikit-learn's GPR, up to 2,000 rows: 20 minutes
     python benchmarks/speed.py checkout --other ../older   # fits by this checkout and by another one, in pairs
 
     python benchmarks/speed.py checkout --other ../older --data ../data   # also torques of a real arm
