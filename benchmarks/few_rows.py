@@ -276,7 +276,9 @@ def main() -> None:
     ]
     one: Callable[[Cell], Any] = partial(run, home=options.data, python=options.peer_python, quick=options.quick)
     n_failures = harness.run_missing(cells, one, output, options.jobs)
-    harness.write_page("Few rows", tables(harness.frame(output)), output, n_failures)
+    harness.write_page(
+        "Few rows, with and without an average over kernels", tables(harness.frame(output)), output, n_failures
+    )
 
 
 if __name__ == "__main__":

@@ -585,7 +585,7 @@ PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables,
     ),
     "rows": ("scaling", rows_cells, run_rows, rows_tables, "Time and memory over rows"),
     "million": ("many_rows", million_cells, run_million, million_tables, "A fit to 1,000,000 rows"),
-    "exact": ("exact_fits", exact_cells, run_exact, exact_tables, "Exact fits"),
+    "exact": ("exact_fits", exact_cells, run_exact, exact_tables, "Exact fits against scikit-learn"),
     "checkout": ("checkout", checkout_cells, run_checkout, checkout_tables, "This checkout against another"),
 }
 
