@@ -1,16 +1,16 @@
 """Few rows: accuracy and intervals with and without the prior of kernel and noise and the average over draws of them.
 
-    python benchmarks/few_rows.py --data ../shared/data                # ten minutes of two cores
+    python benchmarks/few_rows.py --data ../shared/data                # five minutes of two cores
     python benchmarks/few_rows.py --sets "made 50 x 35" diabetes-100 --splits 2
     python benchmarks/few_rows.py --models peers                       # scikit-learn's GPR, and the exact model
     python benchmarks/few_rows.py --models nuts --peer-python ~/numpyro/bin/python --splits 3
     python benchmarks/few_rows.py --quick
 
-"library" compares `EVGPRegressor` with its defaults to the same model without this prior and without an average, as
-in version 0.2: "likeliest". Both are fitted one after the other in one process with one thread, so that their seconds
-can be compared. "peers" are `EGPRegressor` and scikit-learn's `GaussianProcessRegressor`, which have the same kernel
-with one length scale for each column and noise. "nuts" is the exact model in NumPyro (0.22) with the same prior, by
-1,000 draws of its No-U-Turn sampler after 1,000 others. It needs a Python with numpyro, for example of
+"library" compares `EVGPRegressor` with its defaults to the same model without this prior and without an average, as in
+version 0.2: "likeliest". Both are fitted one after the other in one process with one thread, so that their seconds can
+be compared. "peers" are `EGPRegressor` and scikit-learn's `GaussianProcessRegressor`, which have the same kernel with
+one length scale for each column and noise. "nuts" is the exact model in NumPyro (0.22) with the same prior (always of
+weight 1), by 1,000 draws of its No-U-Turn sampler after 1,000 others. It needs a Python with numpyro, for example of
 ``python -m venv ~/numpyro; ~/numpyro/bin/pip install numpyro``.
 
 Sets "made n x d" have n rows of d standard normal columns, of which two matter: y = sin(2 x₀) + x₁ + ε with noise of
@@ -19,7 +19,7 @@ to 1,000 other rows for the test. Columns and y are in units of their std in the
 IFG" have the steps of 2 trajectories with 1 % of noise, and the model EVGP-IFG or RES-VGP. Their NLPD and coverage are
 those of noisy targets.
 
-Coverage is the share of test rows inside of intervals of 95 %.
+Coverage is the share of test rows inside 95 % intervals.
 """
 
 from __future__ import annotations
@@ -206,10 +206,9 @@ def run(cell: Cell, home: Path | None, python: Path | None, quick: bool = False)
 
 def tables(rows: pd.DataFrame) -> harness.Tables:
     """Return a line for each set, with all models, and a summary."""
-    kept = rows.assign(coverage=rows["coverage"].astype(float))
-    order = harness.ordered(SETS, kept["set"])
-    wide = kept.pivot_table(index="set", columns="model", values=["rmse", "nlpd", "coverage", "seconds"]).loc[order]
-    size = kept.groupby("set")["rows"].first().loc[order]
+    order = harness.ordered(SETS, rows["set"])
+    wide = rows.pivot_table(index="set", columns="model", values=["rmse", "nlpd", "coverage", "seconds"]).loc[order]
+    size = rows.groupby("set")["rows"].first().loc[order]
     lines = pd.DataFrame({"set": order})
     models = [name for names in MODELS.values() for name in names if name in wide["rmse"]]
     for score, digits in (("coverage", 3), ("nlpd", 2), ("rmse", 3)):
@@ -219,7 +218,7 @@ def tables(rows: pd.DataFrame) -> harness.Tables:
         return {"sets": lines}
     seconds = wide["seconds"]["evgp"] / wide["seconds"]["likeliest"]
     lines["× seconds"] = harness.text(seconds.reset_index(drop=True), 2)
-    micros = kept.pivot_table(index="set", columns="model", values="us_per_prediction").loc[order]
+    micros = rows.pivot_table(index="set", columns="model", values="us_per_prediction").loc[order]
     slower = micros["evgp"] / micros["likeliest"]
     ratio, gain = wide["rmse"]["evgp"] / wide["rmse"]["likeliest"], wide["nlpd"]["evgp"] - wide["nlpd"]["likeliest"]
     made, systems = wide.index.isin([*SETS[: len(MADE) + 1]]), wide.index.str.endswith(("IFG", "RES"))

@@ -86,6 +86,19 @@ def drawn_weights(group: PredictorGroup, n: int, common: np.ndarray, rng: np.ran
     return group.mean + transposed_times(group.root, normals.transpose(1, 2, 0)).transpose(2, 0, 1)
 
 
+def _with_draws(
+    predictor: Predictor, n: int, rng: np.random.RandomState
+) -> Iterator[tuple[PredictorGroup, list[PredictorGroup], np.ndarray]]:
+    """Yield each group with its draws of kernel and noise, of which most models have one, and that of n functions."""
+    draw_of = np.zeros(n, dtype=int)
+    for index, group in enumerate(predictor.groups):
+        draws = unmixed(group)
+        # All outputs of a function come from one draw, unless they are those of different models.
+        if len(draws) > 1 and (index == 0 or not predictor.n_common):
+            draw_of = rng.randint(len(draws), size=n)
+        yield group, draws, draw_of
+
+
 # --- anywhere: random waves ------------------------------------------------------------------------------------------
 # A function drawn from the prior, made of random waves, is moved to the values at the inducing points that are drawn
 # from q. With P = [V; Hᵀ], weights W drawn from q and f₀ = s aᵀΦ(x), a ~ N(0, I),
@@ -107,15 +120,10 @@ class FunctionSamples(Sequence["SampledFunction"]):
         self._posterior = posterior
         common = common_normals(predictor, n, rng)
         self._groups: list[_Waves | _WavesOfDraws] = []
-        draw_of: np.ndarray | None = None
-        for group in predictor.groups:
-            draws = unmixed(group)
+        for group, draws, draw_of in _with_draws(predictor, n, rng):
             if len(draws) == 1:
                 self._groups.append(_Waves.drawn(group, predictor, n, n_waves, common, rng))
             else:
-                # All outputs of a function come from one draw, unless they are those of different models.
-                if draw_of is None or not predictor.n_common:
-                    draw_of = rng.randint(len(draws), size=n)
                 self._groups.append(_WavesOfDraws.drawn(draws, predictor, draw_of, n_waves, rng))
         self._n = n
 
@@ -339,16 +347,11 @@ class Paths:
         self.predictor = replace(predictor, groups=tuple(replace(group, near=None) for group in predictor.groups))
         common = common_normals(predictor, n, rng)
         self._groups: list[_Path | _PathOfDraws | NearPath] = []
-        draw_of: np.ndarray | None = None
-        for group in predictor.groups:
-            draws = unmixed(group)
+        for group, draws, draw_of in _with_draws(predictor, n, rng):
             if len(draws) == 1:
                 self._groups.append(_path_of(group, n, n_steps, common, rng))
-                continue
-            # As in `FunctionSamples`.
-            if draw_of is None or not predictor.n_common:
-                draw_of = rng.randint(len(draws), size=n)
-            self._groups.append(_PathOfDraws(draws, draw_of, n_steps, rng))
+            else:
+                self._groups.append(_PathOfDraws(draws, draw_of, n_steps, rng))
 
     def step(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Return the noise-free g(x) of each function at its row, (n, o), from inputs (n, d) and features (n, p)."""

@@ -15,10 +15,12 @@ import numpy as np
 from ..kernels.base import Covariance
 from ..model.parameters import ParameterTable, Values
 from ..solvers.base import Limits, Objective
+from ..solvers.lbfgs import curvature_along_axes
 from ..utils.linalg import NotPositiveDefiniteError
 
-# The prior of a length scale: log(length scale / std of the column) ~ N(√2 + ½ log d, 3) for d columns (Hvarfner,
-# Hellsten & Nardi 2024, "Vanilla Bayesian Optimization Performs Great in High Dimensions", eq. 9).
+# The prior of a length scale: log(length scale / std of the column) has this mean plus ½ log d, for d columns, and this
+# standard deviation. (Hvarfner, Hellsten & Nardi 2024, arXiv 2402.02229, have √2 and √3. These predicted better in
+# benchmarks/few_rows.py.)
 _LENGTH_MEAN, _LENGTH_STD = 2.3, 1.4
 # Standard deviations of the logarithms of the signal variance, the noise variance and other hyperparameters. Their
 # median is their start, except that of the noise variance, which is this share of the residuals' variance.
@@ -40,8 +42,8 @@ _ACCEPTED, _CHANGE = 0.8, 1.25
 # Positions are multiples of this many units, and units are powers of 2: rounding errors of one trajectory, which differ
 # between processors, do not reach the next one.
 _GRID, _START_GRID = 2.0**-7, 2.0**-3
-# Limits of units, and the step of differences of gradients, both in log parameters.
-_SHORTEST, _LONGEST, _DIFFERENCE, _PROBES = 2.0**-6, 4.0, 1e-3, 8
+# Limits of units, and the number of differences of gradients that give them.
+_SHORTEST, _LONGEST, _PROBES = 2.0**-6, 4.0, 8
 
 
 @dataclass(frozen=True)
@@ -231,12 +233,8 @@ def _at(energy: Objective, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _units(energy: Objective, x: np.ndarray, rng: np.random.RandomState) -> np.ndarray:
-    """The scale of each coordinate, 1 / √(∂²energy / ∂x²), as a power of 2 (see `solvers.lbfgs.curvature_units`)."""
-    total, here = np.zeros(len(x)), _at(energy, x)[1]
-    for _ in range(_PROBES):
-        signs = rng.choice([-1.0, 1.0], len(x))
-        total += signs * (_at(energy, x + _DIFFERENCE * signs)[1] - here) / _DIFFERENCE
-    curvature = np.maximum(np.abs(total) / _PROBES, _LONGEST**-2)
+    """The scale of each coordinate, 1 / √(∂²energy / ∂x²), as a power of 2."""
+    curvature = np.maximum(curvature_along_axes(lambda x: _at(energy, x)[1], x, _PROBES, rng), _LONGEST**-2)
     return np.clip(2.0 ** np.round(-0.5 * np.log2(curvature)), _SHORTEST, _LONGEST)
 
 

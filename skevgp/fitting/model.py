@@ -153,11 +153,11 @@ class Model:
             # It only gives a start. The bound of Titsias (2009) spreads points better: what they leave out costs more.
             loose = replace(self.sparse, variant=replace(self.sparse.variant, tight=False))
             return BoundObjective(loose, table, blocks)
-        objective: BoundObjective | LikelihoodObjective = (
-            BoundObjective(self.sparse, table, self.blocks)
-            if self.exact is None
-            else LikelihoodObjective(self.exact, table)
-        )
+        objective: Objective
+        if self.exact is not None:
+            objective = LikelihoodObjective(self.exact, table)
+        else:
+            objective = BoundObjective(self.sparse, table, self.blocks)
         if self.hyper_prior is None:
             return objective
         return few_rows.WithPrior(objective, table, self.hyper_prior, self.rows.total)
@@ -190,8 +190,13 @@ class Model:
         if self.rows.is_constant().all():
             return None
         weight = np.sqrt(1.0 - self.rows.total / (self.rules.few_rows * self.n_learned))
-        scatter = np.where(self.rows.is_constant(), 0.0, self.scatter)
-        return few_rows.HyperPrior.of(table, problem.spec.covariance, self.rows.inputs.scale, scatter, weight)
+        kernel, scale = problem.spec.covariance, self.rows.inputs.scale
+        return few_rows.HyperPrior.of(table, kernel, scale, self._variance_of_residuals, weight)
+
+    @property
+    def _variance_of_residuals(self) -> np.ndarray:
+        """The scatter (o,), and 0 for constants."""
+        return np.where(self.rows.is_constant(), 0.0, self.scatter)
 
     def log_hyper_prior(self, values: Values) -> float:
         """The log prior density of kernel and noise, which the objective has."""
@@ -206,11 +211,8 @@ class Model:
         if prior is None or prior.columns is None or prior.columns.sum() < 2:
             return None
         table = self.table.changed("inducing_points", fixed=True)
-        seen, scatter = (
-            partial(self.monitor.silent().iteration, 0),
-            np.where(self.rows.is_constant(), 0.0, self.scatter),
-        )
-        chosen = few_rows.forward_selection(self._energy(table), table, prior, scatter, seen)
+        seen = partial(self.monitor.silent().iteration, 0)
+        chosen = few_rows.forward_selection(self._energy(table), table, prior, self._variance_of_residuals, seen)
         return {name: chosen[name] for name in prior.means}
 
     def draws(self, fit: Fit) -> list[Values]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import Any
@@ -31,12 +31,6 @@ class Mixture(Covariance):
     @property
     def rows(self) -> Preparation:
         return self.kernel.rows
-
-    def prepare(self, inputs: np.ndarray) -> Any:
-        return self.kernel.prepare(inputs)
-
-    def centred(self, centre: np.ndarray) -> Mixture:
-        return replace(self, kernel=self.kernel.centred(centre))
 
     def draws(self, hyperparameters: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
         """Yield c_s and h_s of each draw."""

@@ -35,7 +35,10 @@ from .weights import WeightLikelihood
 
 @dataclass(frozen=True)
 class StackedWhitening:
-    """The whitenings of all draws as one of all of their points, with a block for each draw: a `Whitening`."""
+    """The whitenings of all draws as one of all of their points, with a block for each draw.
+
+    It has what predictions need of a `Whitening`.
+    """
 
     parts: tuple[Whitening, ...]
     # (S,): c_s.
@@ -77,10 +80,6 @@ class StackedWhitening:
         """The variance k(x, x) - |v|² (n,) for a prediction: each draw's is clipped at its rounding error."""
         sets = zip(self._pairs(), self._split(V), strict=True)
         return np.sum([c * part.remaining(prepared, own / np.sqrt(c)) for (c, part), own in sets], axis=0)
-
-    def jitter(self) -> float:
-        """The largest jitter of a draw."""
-        return max(part.jitter() for part in self.parts)
 
     def _pairs(self) -> list[tuple[float, Whitening]]:
         return list(zip(self.factors.tolist(), self.parts, strict=True))

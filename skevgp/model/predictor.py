@@ -29,7 +29,6 @@ class AnyWhitening(Protocol):
     def times_inverse_transposed(self, U: np.ndarray) -> np.ndarray: ...
     def solve(self, prepared: Any, out: np.ndarray) -> np.ndarray: ...
     def remaining(self, prepared: Any, V: np.ndarray) -> np.ndarray: ...
-    def jitter(self) -> float: ...
 
 
 # Predictions of several rows at once take arrays of about this many numbers.
@@ -131,6 +130,7 @@ class PredictorGroup:
     # (o, m + p).
     mean: np.ndarray
     # (o, k, m + p), where k is m + p, or less in the exact model. The last p of the k rows belong to the weights.
+    # Of a mixture it is a `BlockRoot`.
     root: Any
     # (o, p, m): if f is orthogonal to the features, the weights of the best fit are those of ``mean`` and ``root`` plus
     # this times the numbers of f. None: they are those of ``mean`` and ``root``.

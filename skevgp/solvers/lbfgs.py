@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -204,21 +205,28 @@ class LBFGS(Solver):
 
 def curvature_units(objective: Objective, x: np.ndarray, alike: np.ndarray, n_probes: int) -> np.ndarray:
     """Return a step size for each coordinate, 1 / √|∂²loss/∂x²|, averaged over equal integers in ``alike``."""
-    # The diagonal of the Hessian from differences of gradients along random signs v: the mean of
-    # v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). Entries
-    # off the diagonal add to its size by chance, which only makes units smaller.
-    rng, total = np.random.RandomState(0), np.zeros(len(x))
     try:
-        here = objective(x)[1]
-        for _ in range(n_probes):
-            signs = rng.choice([-1.0, 1.0], len(x))
-            there = objective(x + _STEP * signs)[1]
-            with np.errstate(invalid="ignore"):
-                total += signs * (there - here) / _STEP
+        along_axes = curvature_along_axes(lambda x: objective(x)[1], x, n_probes, np.random.RandomState(0))
     except NotPositiveDefiniteError:
         return np.ones(len(x))
     kinds, kind = np.unique(alike, return_inverse=True)
-    if len(kinds) == 0 or not np.isfinite(total).all():
+    if len(kinds) == 0 or not np.isfinite(along_axes).all():
         return np.ones(len(x))
-    curvature = np.bincount(kind, np.abs(total) / n_probes) / np.bincount(kind)
+    curvature = np.bincount(kind, along_axes) / np.bincount(kind)
     return np.clip(1.0 / np.sqrt(np.maximum(curvature, _LONGEST**-2)), _SHORTEST, _LONGEST)[kind]
+
+
+def curvature_along_axes(
+    gradient: Callable[[np.ndarray], np.ndarray], x: np.ndarray, n_probes: int, rng: np.random.RandomState
+) -> np.ndarray:
+    """Estimate |∂²loss/∂x²| of each coordinate from differences of gradients."""
+    # The diagonal of the Hessian from differences of gradients along random signs v: the mean of
+    # v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). Entries
+    # off the diagonal add to its size by chance.
+    total, here = np.zeros(len(x)), gradient(x)
+    for _ in range(n_probes):
+        signs = rng.choice([-1.0, 1.0], len(x))
+        there = gradient(x + _STEP * signs)
+        with np.errstate(invalid="ignore"):
+            total += signs * (there - here) / _STEP
+    return np.abs(total) / n_probes
