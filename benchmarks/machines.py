@@ -82,12 +82,41 @@ def own_urdf(folder: str) -> Callable[[Path], str]:
     return lambda data: str(data / "real" / folder / "robot.urdf")
 
 
+PANDA = {
+    "0 to 4.2 s": (0.0, 4.2),
+    "4.2 to 8.4 s": (4.2, 8.4),
+    "8.4 to 12.6 s": (8.4, 12.6),
+    "13 s to the end": (13.0, None),
+}
+
+
+def of_panda(move: str, data: Path, signals: dict[str, Any]) -> Bunch:
+    """Return a part of the only log of the Panda."""
+    return load_log(data / "real" / "panda" / "panda.csv.gz", columns=columns_of(7), keep=PANDA[move], **signals)
+
+
+@lru_cache
+def panda_without_fingers(_: Path) -> Any:
+    return load_robot("panda", joints=[f"panda_joint{number}" for number in range(1, 8)])
+
+
 def of_ur(robot: str) -> Callable[[str, Path, dict[str, Any]], Bunch]:
-    return lambda move, data, _: robots.log_of(robot, move, data)
+    def read(move: str, data: Path, _: dict[str, Any]) -> Bunch:
+        name, _, part = move.partition(", part ")
+        log = robots.log_of(robot, name, data)
+        if not part:
+            return log
+        first, last = (len(log.data) * number // 3 for number in (int(part) - 1, int(part)))
+        return Bunch(data=log.data[first:last], target=log.target[first:last], pieces=log.pieces[first:last])
+
+    return read
 
 
+PANDA_SPLIT = {"first 12.6 s": (tuple(PANDA)[:3], tuple(PANDA)[3:])}
 UR10E = ("20sec_8harm", "30sec_12harm", "40sec_12harm")
 UR10E_TESTS = ("20sec_7harm", "50sec_12harm", "14harm50sec", "ptp_10_points", "unload")
+UR10E_DAY = tuple(f"50sec_12harm, part {number}" for number in (1, 2, 3))
+UR10E_DAYS = ("20sec_8harm", "20sec_7harm", "30sec_12harm", "14harm50sec", "ptp_10_points", "unload")
 DOUBLE = tuple(f"trajectory_{number}" for number in range(1, 7))
 SIMPLE = ("energy_shaping", "ilqr", "pd_system_identification", "sac")
 KR300 = {"A": (("A",), ("B",)), "B": (("B",), ("A",))}
@@ -128,7 +157,13 @@ MACHINES = {
     "UR10e": Machine(
         lambda data: robots.urdf_of("ur10e", data),
         of_ur("ur10e"),
-        {"three moves": (UR10E, UR10E_TESTS), "one move": (UR10E[1:2], UR10E_TESTS)},
+        {
+            "three moves": (UR10E, UR10E_TESTS),
+            "one move": (UR10E[1:2], UR10E_TESTS),
+        },
+    ),
+    "UR10e, another day": Machine(
+        lambda data: robots.urdf_of("ur10e", data), of_ur("ur10e"), {"February 12": (UR10E_DAY, UR10E_DAYS)}
     ),
     "UR10": Machine(
         lambda _: "ur10",
@@ -153,6 +188,10 @@ MACHINES = {
         each_left_out(SIMPLE),
         {"dt": 0.01, "cutoff": 15.0},
     ),
+    **{
+        f"Panda, {cutoff:g} Hz": Machine(panda_without_fingers, of_panda, PANDA_SPLIT, {"dt": 0.01, "cutoff": cutoff})
+        for cutoff in (2.5, 5.0, 20.0)
+    },
     "ur5, simulated": Machine(lambda _: "ur5", of_simulated("ur5"), SIMULATED),
     "iiwa14, simulated": Machine(lambda _: "iiwa14", of_simulated("iiwa14"), SIMULATED),
 }

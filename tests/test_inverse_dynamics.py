@@ -6,6 +6,7 @@ import pandas as pd
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.signal import butter, filtfilt
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.preprocessing import StandardScaler
 
@@ -68,6 +69,58 @@ def arm():
 def rigid(arm):
     """By the robot's name, and so with a file."""
     return InverseDynamics("ur5", n_inducing=0, random_state=0).fit(arm.X, arm.y, groups=arm.groups)
+
+
+def precise_first_joints(seed, robot, cutoff):
+    """Four seconds of an arm: two precise joints with friction that no feature has, and four with filtered noise."""
+    rng, n = np.random.default_rng(seed), 6
+    X = trajectory(n, seed, seconds=4.0, dt=0.01)
+    body = RigidBodyRegressor(robot).fit(X)
+    y = body.transform(X)[:, :, : 10 * n] @ body.coef_prior(n)[0][: 10 * n]
+    size, v = np.abs(y).max(axis=0) + 0.1, X[:, n : 2 * n]
+    y += size * (0.05 * np.tanh(v / 0.05) + 0.05 * v)
+    y += size * [0.1, 0.1, 0.0, 0.0, 0.0, 0.0] * np.sin(X[:, :n]) * np.tanh(v / 0.05)
+    noise = filtfilt(*butter(2, cutoff / 50.0), rng.normal(size=(len(y) + 400, n)), axis=0)[200:-200]
+    return X, y + size * [0.001, 0.001, 0.05, 0.05, 0.05, 0.05] * noise / noise.std(axis=0)
+
+
+@pytest.mark.parametrize(("cutoff", "seed"), [(2.5, 0), (5.0, 1), (20.0, 2)])
+def test_no_joint_loses_to_least_squares_on_another_move(cutoff, seed):
+    robot = perturb_robot("ur5", 0.2, random_state=seed)
+    logs = [precise_first_joints(100 * seed + move, robot, cutoff) for move in range(4)]
+    X, y = (np.concatenate(parts) for parts in zip(*logs[:3], strict=True))
+    model = InverseDynamics("ur5", n_inducing=0).fit(X, y, groups=np.repeat(np.arange(3), 400))
+    body = RigidBodyRegressor("ur5").fit(X)
+    coef = np.linalg.lstsq(body.transform(X).reshape(y.size, -1), y.ravel(), rcond=None)[0]
+    new, truth = logs[3]
+    ratios = np.mean((model.predict(new) - truth) ** 2, axis=0)
+    ratios /= np.mean((body.transform(new) @ coef - truth) ** 2, axis=0)
+    assert ratios.max() < 1.1
+    assert np.exp(np.mean(np.log(ratios))) < 0.6
+
+
+def test_usual_differences_between_days_widen_intervals_of_another_day():
+    # Moves of one day are alike. On another day, friction is larger.
+    def log(seed, factor):
+        X = trajectory(1, seed)
+        friction = factor * (0.3 * np.tanh(X[:, 1] / 0.05) + 0.2 * X[:, 1])
+        noise = 0.01 * np.random.default_rng(seed).normal(size=len(X))
+        return X, X[:, 2] / 4.0 + 9.81 / 2.0 * np.sin(X[:, 0]) + friction + noise
+
+    logs = [log(seed, 1.0) for seed in range(4)]
+    X, y = (np.concatenate(parts) for parts in zip(*logs, strict=True))
+    moves, (new, torque) = np.repeat(np.arange(4), len(logs[0][1])), log(9, 1.07)
+
+    def inside(model):
+        mean, std = model.predict(new, return_std=True)
+        return np.mean(np.abs(mean - torque) < 2.0 * std)
+
+    only_moves = InverseDynamics("pendulum", n_inducing=0, move_scale_prior=np.zeros(4)).fit(X, y, groups=moves)
+    usual = InverseDynamics("pendulum", n_inducing=0).fit(X, y, groups=moves)
+    assert inside(only_moves) < 0.7 < 0.9 < inside(usual)
+    assert (usual.move_scale_ >= only_moves.move_scale_).all()
+    with pytest.raises(ValueError, match="move_scale_prior must be 4 numbers >= 0"):
+        InverseDynamics("pendulum", move_scale_prior=[0.1, 0.1]).fit(X, y)
 
 
 def test_torques_of_a_new_trajectory_are_known_to_a_hundredth(arm, rigid):

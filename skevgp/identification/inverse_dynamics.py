@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -24,12 +24,19 @@ from ..robots.loading import Robot
 from ..utils.frames import FrameColumns
 from ..utils.shapes import like_y
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import check_magnitude, check_not_vanishing, check_real, unchanged_if_it_fails, validate_numbers
+from ..utils.validation import (
+    as_floats,
+    check_magnitude,
+    check_not_vanishing,
+    check_real,
+    unchanged_if_it_fails,
+    validate_numbers,
+)
 from .identified_robot import IdentifiedRobot
 from .joint_residual import JointResidual, fit_joint_residual
 from .likely_causes import likely_causes
 from .log_check import check_of
-from .moves import FEWEST_MOVES, MoveEffects, of_move
+from .moves import EFFECTS, FEWEST_MOVES, MoveEffects, of_move
 from .rows_of_logs import evenly_spread
 from .weaknesses import weaknesses
 from .weights import Fold, Rows, condensed, folds
@@ -81,6 +88,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Whether to learn a factor for the prior standard deviations of each group of weights: inertial parameters, and
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
         it. Factors of friction are from 1e-4 to 1e4, that of inertial parameters from 1 to 1e4.
+    move_scale_prior : array-like of shape (4,), default=(0.015, 0.05, 0.04, 0.007)
+        Standard deviations between days, which are added to the differences between training moves: of the offset over
+        Coulomb friction, of viscous and of Coulomb friction over itself, and of the gain. The default is what arms
+        show. With zeros, only the training moves count.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -115,7 +126,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     residual_std_ : ndarray of shape (n_outputs,)
         Prior standard deviation of each a_j f_j. It is 0 without f_j.
     residual_models_ : list of EVGPRegressor or None
-        Models f_j, before their means fade. An entry is None if held-out moves do not confirm its f_j.
+        Models f_j, before their means fade. An entry is None if its share is 0.
     residual_share_ : ndarray of shape (n_outputs,)
         Shares a_j.
     correlation_time_ : ndarray of shape (n_outputs,)
@@ -127,7 +138,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Speed below which the sign of friction is unknown and counts as noise, rad/s or m/s.
     move_scale_ : ndarray of shape (n_outputs, 4)
         Standard deviations between moves of the offset, viscous friction, Coulomb friction and relative gain error.
-        With few moves, they are larger than the observed ones.
+        With few moves, they are larger than the observed ones, also because of ``move_scale_prior``.
     move_ : ndarray of shape (n_outputs, 4)
         These four effects in the log of the last `update`, or 0 before it.
     n_iter_ : int
@@ -188,6 +199,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         "consistent": ["boolean"],
         "stiction_velocity": [StrOptions({"auto"}), None],
         "learn_scales": ["boolean"],
+        "move_scale_prior": ["array-like"],
         "n_inducing": [Interval(Integral, 0, None, closed="left")],
         "max_rows": [Interval(Integral, 10, None, closed="left")],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -203,6 +215,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         consistent: bool = False,
         stiction_velocity: Literal["auto"] | None = "auto",
         learn_scales: bool = True,
+        move_scale_prior: Sequence[float] = (0.015, 0.05, 0.04, 0.007),
         n_inducing: int = 40,
         max_rows: int = 3000,
         max_iter: int | None = None,
@@ -214,6 +227,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.consistent = consistent
         self.stiction_velocity = stiction_velocity
         self.learn_scales = learn_scales
+        self.move_scale_prior = move_scale_prior
         self.n_inducing = n_inducing
         self.max_rows = max_rows
         self.max_iter = max_iter
@@ -278,6 +292,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         rows_x: np.ndarray
         rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
+        self._move_scale_prior = as_floats(self.move_scale_prior, "move_scale_prior")
+        if self._move_scale_prior.shape != (len(EFFECTS),) or (self._move_scale_prior < 0.0).any():
+            raise ValueError(f"move_scale_prior must be {len(EFFECTS)} numbers >= 0; got {self.move_scale_prior!r}.")
         self._one_dimensional = targets.ndim == 1
         targets = targets.reshape(len(targets), -1)
         check_magnitude(rows_x, "X")
@@ -370,11 +387,23 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
                 min(float(velocity), _SHARP),
                 some,
                 smooth,
+                self._usual(j),
                 **options,
             )
             for j, velocity in enumerate(weights.prior.velocity)
         )
         return Parallel(n_jobs=self.n_jobs, prefer="threads")(fits)
+
+    def _usual(self, joint: int) -> np.ndarray:
+        """Return the prior standard deviations of the effects of moves on a joint, (4,)."""
+        names = [str(name) for name in self._names(len(self._weights.noise))]
+
+        def friction(kind: str) -> float:
+            name = f"{kind}({self._outputs[joint]})"
+            return abs(float(self._weights.mean[names.index(name)])) if name in names else 0.0
+
+        units = [friction("coulomb"), friction("viscous"), friction("coulomb"), 1.0]
+        return self._move_scale_prior * units
 
     def _set_attributes(self) -> None:
         weights, n_outputs = self._weights, len(self._joints)

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import softmax
 from sklearn.base import clone
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from ..estimators.evgp import EVGPRegressor
 from ..kernels.parse import KernelSpec
 from .moves import FEWEST_MOVES, MoveEffects, terms, variation
-from .rows_of_logs import evenly_spread
+from .rows_of_logs import correlation_time, evenly_spread
 from .stiction import JointNoise, likeliest_noise, noise_at
 from .weights import Fold, Rows
 
@@ -31,8 +31,13 @@ _LEAST = 1e-6
 _OWN = 0.05
 # Limits of rows and iterations of a fit that leaves a move out.
 _ROWS_OF_TRIAL, _ITERATIONS_OF_TRIAL = 500, 20
-# Candidates of the share of f, and the level of the t-test: the probability of keeping a useless f.
-_SHARES, _BY_CHANCE = np.linspace(0.0, 1.0, 11), 0.05
+# Candidates of the share of f. Smaller shares are 0.
+_SHARES, _SMALLEST_SHARE = np.linspace(0.0, 1.0, 11), 0.02
+# A held-out move counts as at most this number of independent rows.
+_MOST_OF_MOVE = 10.0
+# Moves differ more than their scatter shows, because few are held out. So its variance is multiplied by the first
+# number. The second number is the part of the share that is kept, whatever the scatter.
+_SCATTER, _KEPT = 2.0, 0.25
 
 
 class QuietRegressor(EVGPRegressor):
@@ -93,6 +98,7 @@ def fit_joint_residual(
     velocity: float,
     some: np.ndarray,
     smooth: np.ndarray,
+    usual: np.ndarray,
     **options: Any,
 ) -> JointResidual:
     """Fit the Gaussian process of a joint to some of the rows x (n, d). Held-out moves give its share."""
@@ -100,23 +106,24 @@ def fit_joint_residual(
     # weights of the other moves. noise is that of the residual without f. velocity is v_s: at lower speeds, rows count
     # less for f, because the sign of friction is unknown. If filters blur the sign, the noise is larger up to a higher
     # speed than v_s, but there f learns the average friction. some are the indices of the rows that f is fitted to.
-    # smooth (d,) marks the columns of x with long length scales. options are those of EVGPRegressor.
+    # smooth (d,) marks the columns of x with long length scales. usual (4,) has the standard deviations of effects of
+    # moves in general. options are those of EVGPRegressor.
     physics, missed, known = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
     for fold in folds:
         physics[fold.out], known[fold.out] = fold.torques[fold.out], fold.variance
         missed[fold.out] = (target - fold.torques)[fold.out]
 
     def with_moves(model: QuietRegressor | None, share: float, missed: np.ndarray, own: np.ndarray) -> JointResidual:
-        # The variance of errors is the sum of own (n,), the variance of f, of the variance of effects of moves, and of
-        # noise. The variance of weights counts as noise too, because errors of new moves are larger than those of
-        # held-out ones.
+        # The variance of errors is the sum of own (n,), the variance of f, of known (n,), that of the weights, of the
+        # variance of effects of moves, and of noise.
+        own = own + known
         found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
         left = found.variance - float(np.mean(own * found.variance / found.of(speed)))
         floor = _OWN * found.variance if model is not None else noise.variance
         found = found._replace(variance=max(left, floor))
         z = terms(speed, physics, found.velocity)
-        effects, update, found = variation(z, missed, speed, found, own, rows)
-        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own + known)
+        effects, update, found = variation(z, missed, speed, found, own, rows, usual)
+        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own)
         logs = [np.log(max(float(np.mean(squares[rows.groups == move])), 1e-300)) for move in np.unique(rows.groups)]
         return JointResidual(model, found, share, effects, update, effects, np.array(logs))
 
@@ -153,15 +160,23 @@ def fit_joint_residual(
 
 
 def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, moves: np.ndarray) -> float:
-    """Return the share of f with the least error on held-out moves, or 0 if a t-test does not confirm it."""
-    # The criterion is the mean over moves of the logarithm of the mean square error. So each move counts the same,
-    # whatever the size of its torques. f is kept if a t-test confirms that this logarithm falls.
+    """Return the share of f that is expected to give the smallest error on new moves."""
+    # Given the errors of a move with n independent rows and unknown noise, the log density of a share a is
+    # -n/2 log(mean square). Its sum over moves gives the posterior mean of a, with a uniform prior.
+    #
+    # A new move may differ from all held-out ones. If the mean fall of log(mean square) over moves is m, with the
+    # standard error s, the share of m that is not scatter is 1 - s² / m² (James & Stein 1961). The posterior mean is
+    # multiplied by it.
     groups = [moves == move for move in np.unique(moves)]
-    squares = np.array([[np.mean((missed - a * mean)[own] ** 2 / relative[own]) for own in groups] for a in _SHARES])
-    falls = np.log(np.maximum(squares, 1e-300)) - np.log(np.maximum(squares[0], 1e-300))
-    best = int(np.argmin(falls.mean(axis=1)))
-    fall, count = falls[best], len(groups)
-    if best == 0 or count < 2:
+    if len(groups) < 2:
         return 0.0
-    error = fall.std(ddof=1) / np.sqrt(count)
-    return float(_SHARES[best]) if fall.mean() < student.ppf(_BY_CHANCE, count - 1) * error else 0.0
+    squares = np.array([[np.mean((missed - a * mean)[own] ** 2 / relative[own]) for own in groups] for a in _SHARES])
+    falls = np.log(np.maximum(squares, 1e-300)) - np.log(np.maximum(squares[0], 1e-300))  # (shares, moves)
+    time = correlation_time((missed - 0.5 * mean) / np.sqrt(relative), moves)
+    worth = np.minimum([own.sum() / time for own in groups], _MOST_OF_MOVE)
+    share = float(softmax(-0.5 * falls @ worth) @ _SHARES)
+    fall = np.array([np.interp(share, _SHARES, of_move) for of_move in falls.T])
+    mean_fall, error = float(fall.mean()), float(fall.std(ddof=1)) / np.sqrt(len(fall))
+    steady = max(0.0, 1.0 - _SCATTER * (error / mean_fall) ** 2) if mean_fall < 0.0 else 0.0
+    share *= _KEPT + (1.0 - _KEPT) * steady
+    return share if share > _SMALLEST_SHARE else 0.0

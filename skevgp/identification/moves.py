@@ -52,10 +52,17 @@ def terms(speed: np.ndarray, torque: np.ndarray, velocity: float) -> np.ndarray:
 
 
 def variation(
-    z: np.ndarray, missed: np.ndarray, speed: np.ndarray, noise: JointNoise, known: np.ndarray, rows: Rows
+    z: np.ndarray,
+    missed: np.ndarray,
+    speed: np.ndarray,
+    noise: JointNoise,
+    known: np.ndarray,
+    rows: Rows,
+    usual: np.ndarray,
 ) -> Variation:
     """Estimate differences between moves, and the noise within moves, from errors missed (n,) on held-out moves."""
-    # The variance of errors is the sum of `known` (n,), the variance of the predictions, and of the noise.
+    # The variance of errors is the sum of `known` (n,), the variance of the predictions, and of the noise. usual (4,)
+    # has the standard deviations of effects in general.
     #
     # Each move has its own effects d ~ N(0, diag(t)), as in a linear model with random effects. Expectation
     # maximisation finds the most likely t. Rows count less if errors are correlated in time. So slow errors within a
@@ -79,10 +86,11 @@ def variation(
     # Blocks of one or two moves differ less than whole moves do.
     factor = (1.0 + 0.5 / rows.n_moves if rows.n_moves < FEWEST_MOVES else 1.0) / max(1.0, between + inside)
     left = noise._replace(variance=factor * inside * noise.variance)
-    effects = MoveEffects(np.zeros(len(variance)), factor * np.diag(variance))
+    # Moves of one day differ less than those of several days. So the usual variance is added.
+    effects = MoveEffects(np.zeros(len(variance)), np.diag(factor * variance + usual**2))
     update = _update(effects, z, missed, speed, left, known, rows, moves) if rows.n_moves >= FEWEST_MOVES else None
     # With few moves, variances are uncertain. As in Student's t distribution, the variances of a new move are larger.
-    wider = effects._replace(covariance=(1.0 + 2.0 / rows.n_moves) * effects.covariance)
+    wider = effects._replace(covariance=np.diag((1.0 + 2.0 / rows.n_moves) * factor * variance + usual**2))
     return Variation(wider, update, left)
 
 

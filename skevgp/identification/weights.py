@@ -23,6 +23,8 @@ _SINGULAR = 1e-15
 _WIDEST = np.log(1e4)
 # Least noise, as a share of an output's variance.
 _LEAST = 1e-12
+# With standard deviations times this number, a prior has little effect.
+_WEAK = 1e3
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ class Weights:
 def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: Known | None = None) -> Weights:
     """Find the posterior of the weights, with the most likely noise, its correlation and gains."""
     # The posterior is that of a Bayesian linear model (Rasmussen & Williams 2006, eq. 2.8). Gains are linearised around
-    # their last value (Gauss-Newton). The noise variance of output j is multiplied by `correlation_time`, so that
-    # filtered rows count less. Scores s_b = B_bᵀ e_b of groups should then differ as much as their information
+    # their last value (Gauss-Newton). The noise variance is multiplied by a correlation time (`_Problem._times`), so
+    # that filtered rows count less. Scores s_b = B_bᵀ e_b of groups should then differ as much as their information
     # predicts. If they differ more, all information is divided by that ratio, the inflation.
     #
     # The standard deviations of each group of weights are multiplied by a factor t with a log-normal prior, as in
@@ -137,14 +139,15 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
     problem, prior = replace(problem, root=factors[:, np.newaxis] * problem.root), prior.scaled_by(factors)
     state = replace(state, factors=np.ones(len(factors)))
     B, errors = problem.whitened(state)
-    z, covariance = _solve(B, errors)
+    z, covariance = _solve(B.T @ B, B.T @ errors)
     of_rows = B[: rows.targets.size].reshape(*rows.targets.shape, -1)
     left = (errors - B @ z)[: rows.targets.size].reshape(rows.targets.shape)
     inflation = _inflation(of_rows, left, covariance, rows.groups)
     if inflation > 1.0:
         weight = np.ones(len(B))
         weight[: rows.targets.size] = inflation**-0.5
-        z, covariance = _solve(B * weight[:, np.newaxis], errors * weight)
+        B, errors = B * weight[:, np.newaxis], errors * weight
+        z, covariance = _solve(B.T @ B, B.T @ errors)
     mean, root = prior.mean + problem.root @ z, problem.root
     # The surprise is in standard deviations of the given prior, without factors.
     if start is not None:
@@ -226,12 +229,14 @@ class _Problem:
     known: Known | None
     root: np.ndarray
     size: np.ndarray
+    shared: bool  # whether a weight affects several outputs
 
     @classmethod
     def of(cls, rows: Rows, prior: Prior, known: Known | None) -> _Problem:
         y = rows.targets
         size = np.where(y.var(axis=0) > 0.0, y.var(axis=0), np.max(y**2, axis=0))
-        return cls(rows, prior, known, _root(prior.covariance, prior.groups), np.where(size > 0.0, size, 1.0))
+        shared = bool((np.count_nonzero(np.abs(rows.features).max(axis=0), axis=0) > 1).any())
+        return cls(rows, prior, known, _root(prior.covariance, prior.groups), np.where(size > 0.0, size, 1.0), shared)
 
     def first(self, share: float) -> _State:
         """Return the starting state, with this share of each output's variance as noise."""
@@ -252,18 +257,33 @@ class _Problem:
         return state
 
     def _next(self, state: _State) -> _State:
+        # Expectation maximisation: squared errors have the expectation of their posterior. If weights fit the noise of
+        # a joint, its errors are small, and their posterior variance is large.
         rows, prior = self.rows, self.prior
-        z, covariance = _solve(*self.whitened(state))
+        B, errors = self.whitened(state)
+        information, score = B.T @ B, B.T @ errors
+        z, covariance = _solve(information, score)
         mean = prior.mean + state.factors * (self.root @ z)
-        left = rows.targets - _forward(rows.features, mean, prior)
+        of_rows = B[: rows.targets.size]
+        uncertain = np.einsum("np,np->n", of_rows @ covariance, of_rows).reshape(rows.targets.shape)
+        uncertain *= state.times * _variances(state.noise, rows.speed)
+        left = np.sqrt((rows.targets - _forward(rows.features, mean, prior)) ** 2 + uncertain)
         coulomb = np.zeros(len(self.size)) if prior.coulomb is None else np.abs(mean[prior.coulomb])
         noise = [
             likeliest_noise(left[:, o], rows.speed[:, o], float(coulomb[o]), last.velocity, least, last)
             for o, (last, least) in enumerate(zip(state.noise, _LEAST * self.size, strict=True))
         ]
-        spread = np.sqrt(_variances(noise, rows.speed))
-        times = np.array([correlation_time(errors, rows.runs) for errors in (left / spread).T])
+        free = errors - B @ _solve(information, score, 1.0 / _WEAK**2)[0]
+        times = self._times(free[: rows.targets.size].reshape(rows.targets.shape))
         return _State(mean, noise, times, self._next_factors(state, z**2 + np.diag(covariance)))
+
+    def _times(self, errors: np.ndarray) -> np.ndarray:
+        """Return correlation times (o,), given errors (n, o) of a regression with a weak prior."""
+        # With the errors of the regression itself, there would be no way back: if the rows of a joint count little, its
+        # errors are large and slow, and then its rows count even less. For the same reason, joints with shared weights
+        # have the mean of their times.
+        times = np.array([correlation_time(column, self.rows.runs) for column in errors.T])
+        return np.full(len(times), times.mean()) if self.shared else times
 
     def _next_factors(self, state: _State, squares: np.ndarray) -> np.ndarray:
         """Return the factors (P,) after a step of expectation maximisation, given E[z²] (P,)."""
@@ -305,7 +325,8 @@ class _Problem:
         variances = _variances(state.noise, self.rows.speed)
         left = self.rows.targets - _forward(self.rows.features, state.mean, self.prior)
         # Laplace's approximation adds ½ log|Σ|, with the posterior covariance Σ of z.
-        z, covariance = _solve(*self.whitened(state))
+        B, errors = self.whitened(state)
+        z, covariance = _solve(B.T @ B, B.T @ errors)
         of_rows = np.sum(np.log(variances) + left**2 / variances)
         groups = [] if self.prior.groups is None else [group for group in dict.fromkeys(self.prior.groups) if group]
         logs = np.log([state.factors[self.prior.groups == group][0] for group in groups])
@@ -369,15 +390,15 @@ def _variances(noise: list[JointNoise], speed: np.ndarray) -> np.ndarray:
     return np.column_stack([one.of(column) for one, column in zip(noise, speed.T, strict=True)])
 
 
-def _solve(B: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of z ~ N(0, I) given errors = B z + N(0, I)."""
-    # The precision is scaled to a unit diagonal, so that priors of different widths do not lose accuracy.
-    precision = np.eye(B.shape[1]) + B.T @ B
-    scale = np.sqrt(np.diag(precision))
+def _solve(information: np.ndarray, score: np.ndarray, precision: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of z ~ N(0, I / precision) given e = B z + N(0, I), BᵀB and Bᵀe."""
+    # The posterior precision is scaled to a unit diagonal, so that priors of different widths do not lose accuracy.
+    whole = precision * np.eye(len(information)) + information
+    scale = np.sqrt(np.diag(whole))
     # This is SciPy's eigh, because NumPy's divide and conquer does not converge for some finite matrices.
-    eigenvalues, vectors = eigh(precision / np.outer(scale, scale))
+    eigenvalues, vectors = eigh(whole / np.outer(scale, scale))
     root = vectors / np.sqrt(np.maximum(eigenvalues, _SINGULAR)) / scale[:, np.newaxis]
-    return root @ (root.T @ (B.T @ errors)), root @ root.T
+    return root @ (root.T @ score), root @ root.T
 
 
 def _inflation(B: np.ndarray, errors: np.ndarray, covariance: np.ndarray, groups: np.ndarray) -> float:

@@ -32,15 +32,12 @@ def useful():
 
 
 @pytest.mark.parametrize("sizes", [6 * [0.0], 3 * [1.0, -1.0]], ids=["white", "another sign in each move"])
-def test_residual_that_other_moves_do_not_have_is_not_predicted(sizes):
-    model, X = fit(sizes, n_inducing=10, max_iter=10), trajectory(1, 9999)
-    (joint,) = model._joints
-    assert joint.model is None
-    assert joint.share == 0.0
-    assert_array_equal(model.residual_std_, 0.0)
-    physics = fit(sizes, n_inducing=0)
-    for found, expected in zip(model.predict(X, return_std=True), physics.predict(X, return_std=True), strict=True):
-        assert_allclose(found, expected, rtol=1e-6)
+def test_residual_that_other_moves_do_not_have_is_hardly_predicted(sizes):
+    model, physics = fit(sizes, n_inducing=10, max_iter=10), fit(sizes, n_inducing=0)
+    X = trajectory(1, 9999)
+    (mean, std), (expected, scale) = (one.predict(X, return_std=True) for one in (model, physics))
+    assert np.sqrt(np.mean((mean - expected) ** 2)) < 0.2 * scale.mean()
+    assert std.mean() < 1.05 * scale.mean()
 
 
 def test_residual_that_all_moves_have_is_predicted_on_a_new_one(useful):
@@ -80,13 +77,19 @@ def test_mean_is_less_where_it_is_uncertain_and_0_far_from_rows(useful):
         assert_allclose(variance, (joint.share * std) ** 2, rtol=1e-6, atol=1e-12)
 
 
-def test_share_is_that_of_left_out_moves_and_chance_rarely_passes():
+def test_share_is_that_of_left_out_moves_and_little_by_chance():
     rng, moves = np.random.default_rng(0), np.repeat(np.arange(5), 40)
 
-    def share(size, truth):
+    def share(size, truths):
         mean = size * np.repeat(rng.normal(size=20), 10)
-        return _share(truth * mean + rng.normal(size=len(mean)), mean, np.ones(len(mean)), moves)
+        missed = np.repeat(truths, len(mean) // len(truths)) * mean + rng.normal(size=len(mean))
+        return _share(missed, mean, np.ones(len(mean)), moves)
 
-    assert np.mean([share(10.0, 0.6) for _ in range(20)]) == pytest.approx(0.6, abs=0.03)
-    # The probability that a useless f is kept is 5 %. Without a test it would be a half.
-    assert np.mean([share(0.1, 0.0) > 0.0 for _ in range(400)]) < 0.08
+    assert np.mean([share(10.0, [0.6]) for _ in range(20)]) == pytest.approx(0.6, abs=0.03)
+    assert np.mean([share(10.0, [0.0]) for _ in range(20)]) < 0.01
+    assert np.mean([share(1.0, [0.0]) for _ in range(100)]) < 0.05
+    # It helps in some moves and hurts in others.
+    assert np.mean([share(3.0, [1.0, -0.5, 1.0, 0.0, -0.5]) for _ in range(100)]) < 0.1
+    # All moves agree, so the small improvement is real.
+    assert np.mean([share(0.5, [1.0]) for _ in range(100)]) > 0.25
+    assert _share(np.ones(10), np.ones(10), np.ones(10), np.zeros(10)) == 0.0  # nothing was held out

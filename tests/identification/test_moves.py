@@ -29,11 +29,11 @@ class Moves:
         noise = np.concatenate([errors(n_rows, factor, rng) for _ in range(n_moves)])
         self.missed = np.sum(self.z * self.effects[self.move], axis=1) + np.sqrt(variance) * noise
 
-    def variation(self, n_moves=60):
+    def variation(self, n_moves=60, usual=(0.0, 0.0, 0.0, 0.0)):
         noise = JointNoise(float(np.mean(self.missed**2)), 0.0, 0.05)
         column = self.missed[:, np.newaxis]
         rows = Rows(column[:, np.newaxis], column, self.speed[:, np.newaxis], *3 * [self.move], n_moves)
-        found = variation(self.z, self.missed, self.speed, noise, np.zeros(len(column)), rows)
+        found = variation(self.z, self.missed, self.speed, noise, np.zeros(len(column)), rows, np.array(usual))
         return np.diag(found.effects.covariance), found.noise.variance, noise.variance
 
 
@@ -112,6 +112,14 @@ def test_variances_of_few_moves_are_multiplied():
         more, noise, _ = log.variation(n_moves)
         assert_allclose(more, factor * blocks / 1.002 * found)
         assert noise == pytest.approx(blocks * left)
+
+
+def test_usual_variances_are_added():
+    log, usual = Moves([0.0, 0.0, 0.0, 0.0], n_moves=5), np.array([0.3, 0.2, 0.1, 0.05])
+    found, left, _ = log.variation(5)
+    more, noise, _ = log.variation(5, usual)
+    assert_allclose(more - found, usual**2, rtol=1e-6)
+    assert noise == left
 
 
 def test_terms_that_are_zero_have_no_effects():
