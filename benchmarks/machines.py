@@ -6,14 +6,14 @@
     python benchmarks/machines.py check --data ../data             # three minutes of one core
     python benchmarks/machines.py inverse --quick                  # simulated machines only, few rows: a minute
 
-The data folder has the folders real (double_pendulum, simple_pendulum, kr300), ur10e and ur10, or some of them.
+The data folder has the folders real (double_pendulum, simple_pendulum, kr300, panda), ur10e and ur10, or some of them.
 Machines without logs are left out, and simulated machines need none. No row of the logs is written anywhere. A page of
 the documentation says how to add a machine.
 
 *inverse* compares models of joint torques. Each split has whole moves for training and other whole moves for tests.
 Least squares has the rigid-body features with friction, fitted by `numpy.linalg.lstsq`. "updated" is `InverseDynamics`
-after `update` with the first third of each test move. Its scores, and those of least squares that it is compared with,
-are of the rest. It needs three training moves.
+after `update` with the first five seconds of each test move, or with a third of a shorter one. Its scores, and those of
+least squares that it is compared with, are of the rest. It needs three training moves.
 
 *forward* compares models of the state after 20 ms, with `EVGPRegressor`'s defaults. Signals are filtered with 15 Hz.
 Rollouts are of a second, with the recorded torques, from 20 states of each test move.
@@ -157,10 +157,7 @@ MACHINES = {
     "UR10e": Machine(
         lambda data: robots.urdf_of("ur10e", data),
         of_ur("ur10e"),
-        {
-            "three moves": (UR10E, UR10E_TESTS),
-            "one move": (UR10E[1:2], UR10E_TESTS),
-        },
+        {"three moves": (UR10E, UR10E_TESTS), "one move": (UR10E[1:2], UR10E_TESTS)},
     ),
     "UR10e, another day": Machine(
         lambda data: robots.urdf_of("ur10e", data), of_ur("ur10e"), {"February 12": (UR10E_DAY, UR10E_DAYS)}
@@ -233,6 +230,7 @@ def one_dimensional(target: np.ndarray) -> np.ndarray:
 
 Inverse = namedtuple("Inverse", "robot split model size")
 
+UPDATE_ROWS = 500  # five seconds
 LEAST_SQUARES, OURS, UPDATED = "least squares", "InverseDynamics", "InverseDynamics, updated"
 INVERSE = (
     "URDF",
@@ -279,7 +277,7 @@ def run_inverse(cell: Inverse, data: Path | None) -> list[dict[str, Any]]:
         test = rows_of(cell.robot, (move,), data, cell.size)
         X, truth = test.data, test.target
         if cell.model == UPDATED:
-            first = len(X) // 3
+            first = min(UPDATE_ROWS, len(X) // 3)
             model.update(X[:first], one_dimensional(truth[:first]))
             X, truth = X[first:], truth[first:]
         least = np.mean((base.predict(X) - truth) ** 2, axis=0)
@@ -289,14 +287,21 @@ def run_inverse(cell: Inverse, data: Path | None) -> list[dict[str, Any]]:
         for joint in range(truth.shape[1]):
             row = {"test": move, "joint": joint + 1}
             row |= {"nmse": errors[joint] / variance[joint], "least": least[joint] / variance[joint]}
-            row |= dict.fromkeys(("cr1", "cr2", "cr3", "nlpd", "crps"), "")
+            row |= dict.fromkeys(("cr1", "cr2", "cr3", "nlpd", "crps", "interval"), "")
             if std is not None:
                 own = truth[:, [joint]], mean[:, [joint]], np.reshape(std, truth.shape)[:, [joint]]
                 row |= dict(zip(("cr1", "cr2", "cr3"), containing_ratios(*own), strict=True))
                 row |= {"nlpd": negative_log_predictive_density(*own) - 0.5 * np.log(variance[joint])}
                 row["crps"] = crps(*own) / np.sqrt(variance[joint])
+                row["interval"] = interval_score(*own) / np.sqrt(variance[joint])
             found.append({**row, "n_train": len(train.data), "n_test": len(truth), "fit_seconds": seconds})
     return found
+
+
+def interval_score(truth: np.ndarray, mean: np.ndarray, std: np.ndarray) -> float:
+    """Return the interval score of 95 % intervals (Gneiting & Raftery 2007, eq. 43)."""
+    low, high = mean - robots.INTERVAL * std, mean + robots.INTERVAL * std
+    return float(np.mean(high - low + 40.0 * (np.maximum(low - truth, 0.0) + np.maximum(truth - high, 0.0))))
 
 
 def inverse_tables(rows: pd.DataFrame) -> harness.Tables:
@@ -320,7 +325,10 @@ def inverse_tables(rows: pd.DataFrame) -> harness.Tables:
                 "largest": own["ratio"].max(),
                 "CR-2": f"{own['cr2'].mean():.3f}",
                 "least of a joint": f"{joints.groupby('joint')['cr2'].mean().min():.3f}",
+                "CRPS": geometric(joints["crps"].astype(float)),
+                "interval score": geometric(joints["interval"].astype(float)),
                 "updated: error / least squares": geometric(updated["ratio"]) if len(updated) else np.nan,
+                "updated: CR-2": f"{updated['cr2'].mean():.3f}" if len(updated) else "",
                 "seconds": joints.groupby("split")["fit_seconds"].first().mean(),
             }
         )
@@ -586,12 +594,17 @@ def main() -> None:
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--data", type=Path, help="the folder of logs; default: simulated machines only")
     parser.add_argument("--machines", nargs="+", choices=MACHINES, default=list(MACHINES), help="default: all")
+    parser.add_argument("--models", nargs="+", choices=INVERSE, default=INVERSE, help="models of inverse; default: all")
     options = harness.parse(parser)
     name, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, name)
     data = options.data.resolve() if options.data else None
     machines = [machine for machine in options.machines if there(machine, data)]
-    cells = cells_of(options.part, machines, options.size)
+    cells = [
+        cell
+        for cell in cells_of(options.part, machines, options.size)
+        if options.part != "inverse" or cell.model in options.models
+    ]
     n_failures = harness.run_missing(cells, partial(run, data=data), output, options.jobs) if cells else 0
     rows = harness.frame(output, size=options.size)
     if not len(rows):

@@ -265,7 +265,7 @@ class _Problem:
         z, covariance = _solve(information, score)
         mean = prior.mean + state.factors * (self.root @ z)
         of_rows = B[: rows.targets.size]
-        uncertain = np.einsum("np,np->n", of_rows @ covariance, of_rows).reshape(rows.targets.shape)
+        uncertain = np.maximum(np.einsum("np,np->n", of_rows @ covariance, of_rows), 0.0).reshape(rows.targets.shape)
         uncertain *= state.times * _variances(state.noise, rows.speed)
         left = np.sqrt((rows.targets - _forward(rows.features, mean, prior)) ** 2 + uncertain)
         coulomb = np.zeros(len(self.size)) if prior.coulomb is None else np.abs(mean[prior.coulomb])
