@@ -173,7 +173,8 @@ def load_log(
             acceleration or effort. They are cut;
           - ``n_held``: number of rows that repeat the frame before them while joints move. They are cut;
           - ``wrapped`` and ``periods``: dict of the number of unwrapped jumps, and of their periods, for each joint;
-          - ``delay``: ndarray of shape (n_joints,), with the delays of the efforts in s;
+          - ``delay`` and ``delay_is_estimated``: ndarray of shape (n_joints,), with the delays of the efforts in s, and
+            whether they were estimated;
           - ``start``: time of the first row by the clock of the file, s;
           - ``n_repeated`` and ``n_incomplete``: number of rows with the time of another row, and of incomplete rows at
             both ends;
@@ -391,6 +392,7 @@ def _recording(
         of_file, raw = raw, motors.joints(raw)
         parts, wrapped = list(pieces(raw.time, gap, breaks)), motors.steps_of_joints(found.wrapped)
         _check_derivatives(raw, parts, names, wrapped, how)
+        is_estimated = isinstance(delay, RecordedRobot)
         if isinstance(delay, RecordedRobot):
             delay = np.full(len(names), estimate_delay(raw, step, gap, how, breaks, delay))
         done = process(raw, step, gap, how, breaks, delay if delay.any() else None)
@@ -410,6 +412,7 @@ def _recording(
         wrapped=dict(zip(read.joint_names, found.wraps, strict=True)),
         periods={n: period for n, period in zip(read.joint_names, found.periods, strict=True) if period is not None},
         delay=delay,
+        delay_is_estimated=is_estimated,
     )
 
 

@@ -10,19 +10,33 @@ from sklearn.utils import Bunch
 from ...utils.validation import check_integer
 from .signals import runs
 
+# The delay of velocities: length of windows, s; the fewest windows; limits, in rows and s; standard errors above 0.
+_WINDOW, _FEWEST, _LEAST_DELAY, _LONGEST_DELAY, _CLEAR = 0.1, 20, 0.1, 0.1, 5.0
+# From this stride on, velocities are averaged.
+_AVERAGED = 4
+
 
 @overload
-def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[False] = ...) -> Bunch: ...
+def log_transitions(log: Bunch, *, stride: int = ..., align: bool = ..., return_X_y: Literal[False] = ...) -> Bunch: ...
 @overload
-def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[True]) -> tuple[np.ndarray, np.ndarray]: ...
-def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) -> Bunch | tuple[np.ndarray, np.ndarray]:
+def log_transitions(
+    log: Bunch, *, stride: int = ..., align: bool = ..., return_X_y: Literal[True]
+) -> tuple[np.ndarray, np.ndarray]: ...
+def log_transitions(
+    log: Bunch, *, stride: int = 1, align: bool = True, return_X_y: bool = False
+) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Turn logs into state transitions with their own time steps, as data for forward dynamics.
 
     A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
     the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
     gap, a jump of a position, a corrupt value, a repeated frame or rest are left out, and so are rows with the time of
-    another row. If `load_log` had a ``delay``, the torque of a transition is the mean of the efforts that were recorded
-    later by this delay.
+    another row.
+
+    Velocities of many drives are differences of positions, and so they are late by half a row or more. This delay is
+    found from positions and velocities, and positions are taken earlier by it (``align``). If `load_log` had a
+    ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay. With
+    ``delay="auto"``, efforts and velocities belong together, whether the drive records the torque to come or the last
+    one. Use it if rows are far apart, and pass the robot.
     :doc:`Learn the next state from your own logs </howto/next_state>` has an example, and one without velocities.
 
     Parameters
@@ -31,7 +45,11 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
         Logs, as returned by `load_log`.
     stride : int, default=1
         Number of recorded rows from a state to the next, at least 1. Transitions do not overlap. The torque is the mean
-        of the rows between, weighted by their durations.
+        of the rows between, weighted by their durations. From 4 rows on, the velocity of a state is its mean over half
+        of this number of rows around the state, because a velocity of a single row is noisy.
+    align : bool, default=True
+        Whether to take positions at the time of the velocities, and to average velocities. If False, states are those
+        of the recording.
     return_X_y : bool, default=False
         Whether to return ``(data, target)`` instead of a Bunch.
 
@@ -45,6 +63,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
         - ``target`` : ndarray of shape (n_rows, 2 * n_joints), with positions and velocities after ``dt``;
         - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
         - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
+        - ``velocity_delay`` : ndarray of shape (n_files,), time by which velocities are late, s;
         - ``joint_names``, ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
         Returned only if ``return_X_y`` is True.
@@ -62,8 +81,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     Notes
     -----
-    The torque of a row is held until the next row. The torque of the next row is not used, because a controller
-    computes it from the noisy target.
+    Without ``delay="auto"``, the torque of a row is held until the next row. The torque of the next row is not used,
+    because a controller computes it from the noisy target.
 
     Examples
     --------
@@ -89,7 +108,10 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     check_integer(stride, "stride", minimum=1)
     if not isinstance(log, Bunch) or "recordings" not in log:
         raise TypeError(f"log must be a result of load_log; got {type(log).__name__}.")
-    parts = [_transitions(recording, stride) for recording in log.recordings]
+    delays = [_velocity_delay(recording) if align else 0.0 for recording in log.recordings]
+    parts = [
+        _transitions(recording, stride, delay, align) for recording, delay in zip(log.recordings, delays, strict=True)
+    ]
     lengths = [len(part) for part in parts]
     if not any(lengths):
         raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest. Lower stride={stride}.")
@@ -105,6 +127,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
         target=target,
         groups=np.repeat(np.arange(len(parts)), lengths),
         time=time,
+        velocity_delay=np.array(delays),
         joint_names=log.joint_names,
         feature_names=[*states, *log.target_names, "dt"],
         target_names=states,
@@ -128,37 +151,111 @@ def _rounded(steps: np.ndarray, latest: float) -> np.ndarray:
     return np.round(steps, max(0, int(-np.log10(2.0 * np.spacing(max(latest, 1.0))))))
 
 
-def _transitions(recording: Bunch, stride: int) -> np.ndarray:
-    """Return rows of state, torque, dt, next state and time."""
-    raw = recording.raw
-    if raw.velocity is None:
+def _velocities(recording: Bunch) -> np.ndarray:
+    if recording.raw.velocity is None:
         raise ValueError(
             f"{recording.filename}: there are no recorded velocities, which the states need. If the file has some, "
             'pass their columns, without velocity="derive". Otherwise make rows from the filtered log.data, as in the '
             'how-to "Learn the next state from your own logs". Differences of unfiltered positions are too noisy.'
         )
-    steps = np.diff(raw.time)
-    whole = np.ones(len(steps), dtype=bool)
-    # Efforts that act in a step were recorded later by their delay.
-    late = np.append(recording.delay, 0.0)
+    return np.asarray(recording.raw.velocity)
+
+
+def _whole(recording: Bunch) -> np.ndarray:
+    """Return whether there is motion without a fault from a row to the next, (n - 1,)."""
+    time = recording.raw.time
+    whole = np.ones(len(time) - 1, dtype=bool)
     for first, last, why in recording.cuts:
         if why in ("gap", "rest", "jump", "corrupt", "held"):
-            whole &= (raw.time[1:] <= first) | (raw.time[:-1] >= last)
+            whole &= (time[1:] <= first) | (time[:-1] >= last)
+    return whole
+
+
+def _integral(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return the integral of samples (n, k) by the trapezoidal rule, (n, k)."""
+    steps = np.diff(time)[:, np.newaxis]
+    return np.vstack([np.zeros_like(signal[:1]), np.cumsum(0.5 * (signal[1:] + signal[:-1]) * steps, axis=0)])
+
+
+def _at(times: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return signals (n, k) at other times, by linear interpolation."""
+    return np.column_stack([np.interp(times, time, column) for column in signal.T])
+
+
+def _averaged(time: np.ndarray, signal: np.ndarray, at: np.ndarray, half: float) -> np.ndarray:
+    """Return means of a signal (n, k) over times around some of its rows, up to this half width within the signal."""
+    width = np.minimum(half, np.minimum(at - time[0], time[-1] - at))
+    integral = _integral(time, signal)
+    change = _at(at + width, time, integral) - _at(at - width, time, integral)
+    found = _at(at, time, signal)
+    inside = width > 0.0
+    found[inside] = change[inside] / (2.0 * width[inside, np.newaxis])
+    return found
+
+
+def _velocity_delay(recording: Bunch) -> float:
+    """Return the time by which velocities are later than positions, s; 0 if none is clear."""
+    # With v(t) = q̇(t - d), the change of position in a window is ∫ v dt + d Δv to first order. So d is the slope of the
+    # difference over Δv.
+    velocity, time = _velocities(recording), recording.raw.time
+    step = float(np.median(np.diff(time)))
+    length = max(1, round(_WINDOW / step))
+    moving = np.array([start for run in runs(_whole(recording)) for start in range(run.start, run.stop - length + 1)])
+    if len(moving) < _FEWEST:
+        return 0.0
+    integral = _integral(time, velocity)
+    ends = moving + length
+    change = velocity[ends] - velocity[moving]
+    missed = recording.raw.position[ends] - recording.raw.position[moving] - (integral[ends] - integral[moving])
+    total = float(np.sum(change**2))
+    if total == 0.0 or not np.isfinite([total, np.sum(missed**2)]).all():
+        return 0.0
+    delay = float(np.sum(missed * change)) / total
+    # Windows overlap, so fewer than all are independent.
+    error = np.sqrt(float(np.mean((missed - delay * change) ** 2)) * length / total)
+    return delay if _LEAST_DELAY * step < delay < _LONGEST_DELAY and delay > _CLEAR * error else 0.0
+
+
+def _transitions(recording: Bunch, stride: int, lag: float, align: bool) -> np.ndarray:
+    """Return rows of state, torque, dt, next state and time."""
+    raw, velocity, whole = recording.raw, _velocities(recording), _whole(recording)
+    time, steps = raw.time, np.diff(raw.time)
+    # Efforts that act in a step were recorded later by their delay. An estimated delay is that of efforts at the rows
+    # behind velocities. Any other delay is that of efforts which are held until the next row, behind positions.
+    late = np.append(recording.delay, 0.0) - (0.0 if recording.delay_is_estimated else lag)
+    for first, last, why in recording.cuts:
         if why == "gap":
-            whole &= (raw.time[1:] + late.max() <= first) | (raw.time[:-1] + late.min() >= last)
-    whole &= (raw.time[:-1] + late.min() >= raw.time[0]) & (raw.time[1:] + late.max() <= raw.time[-1])
-    starts = np.concatenate(
-        [np.arange(run.start, run.stop - stride + 1, stride) for run in runs(whole)] or [np.empty(0, dtype=np.intp)]
-    )
-    ends = starts + stride
-    states = np.hstack([raw.position, raw.velocity])
-    dt = (raw.time[ends] - raw.time[starts])[:, np.newaxis]
-    impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
-    if recording.delay.any():
-        impulse = np.column_stack(
-            [np.interp(raw.time + delay, raw.time, own) for delay, own in zip(recording.delay, impulse.T, strict=True)]
-        )
-        torque = (impulse[ends] - impulse[starts]) / dt
+            whole &= (time[1:] + late.max() <= first) | (time[:-1] + late.min() >= last)
+    whole &= (time[:-1] + late.min() >= time[0]) & (time[1:] + late.max() <= time[-1])
+    if recording.delay_is_estimated:
+        impulse = _integral(time, raw.torque)
     else:
-        torque = raw.torque[starts] if stride == 1 else (impulse[ends] - impulse[starts]) / dt
-    return np.hstack([states[starts], torque, dt, states[ends], raw.time[starts, np.newaxis]])
+        impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
+    n_late = int(np.ceil(lag / np.median(steps))) if lag else 0
+    found = []
+    for run in runs(whole):
+        starts = np.arange(run.start + n_late, run.stop - stride + 1, stride)
+        if not len(starts):
+            continue
+        rows = np.append(starts, starts[-1] + stride)
+        of_run = slice(run.start, run.stop + 1)
+        positions, speeds = raw.position[rows], velocity[rows]
+        if lag:
+            positions = _at(time[rows] - lag, time[of_run], raw.position[of_run])
+        if align and stride >= _AVERAGED:
+            speeds = _averaged(time[of_run], velocity[of_run], time[rows], 0.25 * stride * float(np.median(steps)))
+        states = np.hstack([positions, speeds])
+        dt = np.diff(time[rows])[:, np.newaxis]
+        if late[:-1].any() or recording.delay_is_estimated:
+            torque = np.column_stack(
+                [
+                    np.diff(np.interp(time[rows] + delay, time, own))
+                    for delay, own in zip(late[:-1], impulse.T, strict=True)
+                ]
+            )
+            torque /= dt
+        else:
+            torque = raw.torque[starts] if stride == 1 else np.diff(impulse[rows], axis=0) / dt
+        found.append(np.hstack([states[:-1], torque, dt, states[1:], time[starts, np.newaxis]]))
+    width = 5 * raw.position.shape[1] + 2
+    return np.vstack(found) if found else np.empty((0, width))

@@ -3,7 +3,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.utils import Bunch
 
-from skevgp.datasets import load_log, log_transitions
+from skevgp.datasets import load_log, log_transitions, simulate
+from skevgp.exceptions import RobotModelWarning, ignored
 
 from .cases import BY_NUMBER, irregular_times, motion, table_of, write_table
 
@@ -47,7 +48,7 @@ def test_steps_of_a_regular_clock_are_equal(load, start, n_rows):
 
 @pytest.mark.parametrize("stride", [2, 5])
 def test_with_a_stride_states_follow_each_other_and_torques_are_means(load, stride):
-    states, torques, dt, then = parts(log_transitions(load(table_of(T)), stride=stride))
+    states, torques, dt, then = parts(log_transitions(load(table_of(T)), stride=stride, align=False))
     q, dq, _, current = motion(T)
     starts = np.arange(0, len(T) - stride, stride)
     assert_allclose(states, np.hstack([q, dq])[starts], atol=1e-10)
@@ -57,6 +58,60 @@ def test_with_a_stride_states_follow_each_other_and_torques_are_means(load, stri
         way = slice(start, start + stride)
         mean = np.average(GAIN * current[way], axis=0, weights=np.diff(T)[way])
         assert_allclose(torques[row], mean, atol=1e-8)
+
+
+def test_velocities_of_long_strides_are_means_around_the_state(load):
+    t = 0.01 * np.arange(800)
+    table, rng = table_of(t), np.random.default_rng(0)
+    table[:, 4:6] += 0.2 * rng.normal(size=(len(t), 2))
+    log = load(table, rest_velocity=0.0)
+    noisy, found = (parts(log_transitions(log, stride=12, align=align))[0] for align in (False, True))
+    truth = motion(t)[1][: 12 * len(found) : 12]
+    errors = [np.sqrt(np.mean((states[2:-2, 2:] - truth[2:-2]) ** 2)) for states in (noisy, found)]
+    assert_allclose(errors[0], 0.2, rtol=0.2)
+    assert errors[1] < 0.6 * errors[0]  # half of 12 rows: 1 / sqrt(6), and the curvature of the motion
+    assert_array_equal(found[:, :2], noisy[:, :2])
+    assert_array_equal(found[0], noisy[0])  # there are no rows before the first
+
+
+@pytest.mark.parametrize("rows_late", [0.0, 0.5, 0.8])
+def test_positions_are_taken_at_the_time_of_late_velocities(load, rows_late):
+    t, late = 0.03 * np.arange(400), 0.03 * rows_late
+    table = table_of(t)
+    table[:, 4:6] = motion(t - late)[1]
+    found = log_transitions(load(table, rest_velocity=0.0))
+    assert_allclose(found.velocity_delay, late, atol=5e-4)
+    states, _, _, then = parts(found)
+    q, dq, _, _ = motion(found.time + t[0] - late)
+    assert_allclose(states, np.hstack([q, dq]), atol=4e-3)  # by linear interpolation
+    assert_array_equal(states[1:], then[:-1])
+    assert_array_equal(log_transitions(load(table, rest_velocity=0.0), align=False).velocity_delay, 0.0)
+
+
+@pytest.mark.parametrize("recorded", ["next", "last"])
+def test_with_an_estimated_delay_the_torque_is_that_of_the_transition(tmp_path, recorded):
+    """A pendulum with a held torque. Velocities are differences of positions, as those of many drives."""
+    rng, h = np.random.default_rng(0), 0.03
+    held = np.repeat(rng.uniform(-3.0, 3.0, 200), 2)
+    fine, state = [], np.array([[0.3, 0.0]])
+    for u in held:
+        way = simulate("pendulum", state, np.full((1, 30, 1), u), h / 30.0)[0]
+        state = way[-1:]
+        fine.append(way[0])
+    q = np.array(fine)[:, 0]
+    velocity = np.diff(q, prepend=q[0]) / h
+    effort = held if recorded == "next" else np.append(0.0, held[:-1])
+    table = np.column_stack([h * np.arange(len(q)), q, velocity, effort])[1:]
+    file = write_table(tmp_path / "log.csv", table)
+    columns = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+    with ignored(category=RobotModelWarning):
+        log = load_log(file, columns=columns, robot="pendulum", delay="auto", wrap=False, cutoff=10.0)
+    found = log_transitions(log)
+    assert_allclose(found.velocity_delay, h / 2.0, rtol=0.05)
+    # States are those at half of a row before. So each transition has half of two torques.
+    middle = np.searchsorted(table[:, 0], found.time + table[0, 0] - 1e-6) + 1
+    assert_allclose(found.data[:, 2], 0.5 * (held[middle - 1] + held[middle]), atol=0.6)
+    assert np.corrcoef(found.data[:, 2], 0.5 * (held[middle - 1] + held[middle]))[0, 1] > 0.98
 
 
 @pytest.mark.parametrize("stride", [1, 3])
