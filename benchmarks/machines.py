@@ -2,11 +2,13 @@
 
     python benchmarks/machines.py inverse --data ../data           # a quarter of an hour of one core
     python benchmarks/machines.py forward --data ../data           # five minutes of one core
+    python benchmarks/machines.py acrobot --data ../data           # five minutes of one core
     python benchmarks/machines.py contact --data ../data           # five minutes of one core
     python benchmarks/machines.py check --data ../data             # three minutes of one core
     python benchmarks/machines.py inverse --quick                  # simulated machines only, few rows: a minute
 
-The data folder has the folders real (double_pendulum, simple_pendulum, kr300, panda), ur10e and ur10, or some of them.
+The data folder has the folders real (acrobot, double_pendulum, simple_pendulum, kr300, panda), ur10e and ur10, or some
+of them.
 Machines without logs are left out, and simulated machines need none. No row of the logs is written anywhere. A page of
 the documentation says how to add a machine.
 
@@ -15,8 +17,15 @@ Least squares has the rigid-body features with friction, fitted by `numpy.linalg
 after `update` with the first five seconds of each test move, or with a third of a shorter one. Its scores, and those of
 least squares that it is compared with, are of the rest. It needs three training moves.
 
+If there is a CSV of the same name with the ending "_before", made by the same command with another version of skevgp,
+a table compares both.
+
 *forward* compares models of the state after 20 ms, with `EVGPRegressor`'s defaults. Signals are filtered with 15 Hz.
 Rollouts are of a second, with the recorded torques, from 20 states of each test move.
+
+*acrobot* compares models of the state after about 26 ms. They are trained on two swing-ups of a real acrobot by one
+controller (TVLQR), and tested on a third one and on two swing-ups by another controller (MC-PILCO). Their rows are from
+`log_transitions`, with its defaults and an estimated delay of efforts, or as recorded.
 
 *contact* fits `ContactMonitor` to clean moves that the model was not fitted to, and tests it on another one. Simulated
 pushes are twice as large as ``detectable_`` and last 0.4 s. A push counts as found if there is an alarm, and none
@@ -45,8 +54,16 @@ import harness
 import robots
 from robots import LinearThenGP, LinearTorques, geometric
 from skevgp import ContactMonitor, EVGPRegressor, InverseDynamics, ResidualRegressor, rollout
-from skevgp.datasets import load_log, load_robot, perturb_robot
-from skevgp.features import InertiaForce, InertiaForceGravity, NominalDynamics, RigidBodyRegressor
+from skevgp.datasets import load_log, load_robot, log_transitions, perturb_robot
+from skevgp.features import (
+    AngleEncoder,
+    Friction,
+    InertiaForce,
+    InertiaForceGravity,
+    LogNormal,
+    NominalDynamics,
+    RigidBodyRegressor,
+)
 from skevgp.metrics import containing_ratios, crps, negative_log_predictive_density
 
 # --- machines ------------------------------------------------------------------------------------------------------
@@ -342,6 +359,22 @@ def inverse_tables(rows: pd.DataFrame) -> harness.Tables:
     return {"machines": pd.DataFrame(lines), "models": models.reset_index(names=""), "moves": table}
 
 
+def against(rows: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
+    """Compare `InverseDynamics` with an earlier version: geometric means of ratios over joints and test moves."""
+    keys = ["robot", "split", "test", "joint"]
+    now, then = (one[one["model"] == OURS].set_index(keys) for one in (rows, before))
+    both = now.join(then.add_suffix("_before"), how="inner")
+    lines = []
+    for machine in [name for name in MACHINES if name in both.index.get_level_values("robot")]:
+        own = both.xs(machine, level="robot")
+        line: dict[str, Any] = {"machine": machine}
+        for name, title in {"nmse": "error", "crps": "CRPS", "interval": "interval score"}.items():
+            line[title] = geometric(own[name].astype(float) / own[f"{name}_before"].astype(float))
+        line |= {"CR-2 before": f"{own['cr2_before'].mean():.3f}", "now": f"{own['cr2'].mean():.3f}"}
+        lines.append(line | {"seconds": geometric(own["fit_seconds"] / own["fit_seconds_before"])})
+    return pd.DataFrame(lines)
+
+
 # --- forward dynamics ----------------------------------------------------------------------------------------------
 
 Forward = namedtuple("Forward", "robot split model size")
@@ -431,6 +464,94 @@ def forward_tables(rows: pd.DataFrame) -> harness.Tables:
         table[name] = harness.text(table[name], 3)
     names = {"nmse": "nMSE of the change", "cr2": "CR-2", "sample": "rollouts within 2 std", "linearized": "linearized"}
     return {"forward": table.rename(columns=names | {"robot": "machine", "error": "error of rollouts"})}
+
+
+# --- the next state under another controller ----------------------------------------------------------------------
+
+Acrobot = namedtuple("Acrobot", "rows left_out model size")
+
+ROWS, CONTROLLERS = ("aligned", "as recorded"), ("same controller", "another controller")
+ACROBOT = ("RES", "IFG", "IF, nominal, friction", "IF, nominal with parameters, friction")
+STRIDE = 13  # rows of TVLQR, which are 2 ms apart. Those of MC-PILCO are 30 ms apart
+
+
+def acrobot_rows(names: list[str], stride: int, how: str, data: Path) -> Bunch:
+    folder = data / "real"
+    options = {"delay": "auto", "robot": str(folder / "double_pendulum" / "robot.urdf")} if how == "aligned" else {}
+    files = [folder / "acrobot" / f"{name}.csv.gz" for name in names]
+    return log_transitions(load_log(files, columns=columns_of(2), **options), stride=stride, align=how == "aligned")
+
+
+def acrobot_model(name: str, robot: Any, quick: bool) -> Any:
+    short = {"max_iter": 5, "n_inducing": 10} if quick else {}
+    options = {"kernel_map": AngleEncoder(robot, dt="column"), "random_state": 0, **short}
+    wide = {f"inertia(Joint{j})": LogNormal(1.0, 1.0) for j in (1, 2)}
+    parameters = wide | {f"mass(Joint{j})": LogNormal(1.0, 0.3) for j in (1, 2)}
+
+    def union(**own: Any) -> Any:
+        maps = InertiaForce(robot, dt="column"), NominalDynamics(robot, dt="column", **own)
+        return make_union(*maps, Friction(robot, dt="column"))
+
+    if name == "RES":
+        return ResidualRegressor(EVGPRegressor(**options))
+    features = {
+        "IFG": InertiaForceGravity(robot, dt="column"),
+        "IF, nominal, friction": union(),
+        "IF, nominal with parameters, friction": union(parameters=parameters),
+    }[name]
+    return EVGPRegressor(features, **options)
+
+
+def run_acrobot(cell: Acrobot, data: Path | None) -> list[dict[str, Any]]:
+    """Fit a model to two runs, and judge each column of the state on the third one and on the other controller's."""
+    folder = data or Path()
+    runs = [f"tvlqr_{number}" for number in (1, 2, 3)]
+    train = acrobot_rows([run for run in runs if run != cell.left_out], STRIDE, cell.rows, folder)
+    tests = {
+        CONTROLLERS[0]: acrobot_rows([cell.left_out], STRIDE, cell.rows, folder),
+        CONTROLLERS[1]: acrobot_rows(["mcpilco_1", "mcpilco_2"], 1, cell.rows, folder),
+    }
+    model = acrobot_model(cell.model, load_robot(str(folder / "real/double_pendulum/robot.urdf")), cell.size == "quick")
+    seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, groups=train.groups))
+    found = []
+    for test, rows in tests.items():
+        mean, std = model.predict(rows.data, return_std=True)
+        change = (rows.target - rows.data[:, : rows.target.shape[1]]).var(axis=0)
+        for number, column in enumerate(rows.target_names):
+            own = rows.target[:, [number]], mean[:, [number]], std[:, [number]]
+            score = {"nmse": np.mean((own[1] - own[0]) ** 2) / change[number], "cr2": containing_ratios(*own)[1]}
+            sizes = {"n_train": len(train.data), "n_test": len(rows.data), "fit_seconds": seconds}
+            found.append({"test": test, "column": column, **score, **sizes})
+    return found
+
+
+def acrobot_tables(rows: pd.DataFrame) -> harness.Tables:
+    means = rows.groupby(["rows", "model", "test", "left_out"], sort=False)
+    means = means.agg(nmse=("nmse", geometric)).groupby(["rows", "model", "test"], sort=False)["nmse"].agg(geometric)
+    errors = means.unstack()[list(CONTROLLERS)].reset_index()
+    shares = rows[rows["rows"] == ROWS[0]].groupby(["model", "test", "column"], sort=False)["cr2"].mean().unstack()
+    shares = shares.map("{:.3f}".format).reset_index()
+    return {"errors": errors, "shares": shares}
+
+
+def plot_acrobot(rows: pd.DataFrame, path: Path) -> None:
+    """Draw the error of each model on both controllers, with aligned rows and with rows as recorded."""
+    figure, axes = harness.pyplot().subplots(
+        1, 2, figsize=(harness.WIDTH, 2.4), sharey=True, sharex=True, layout="constrained"
+    )
+    for axis, test in zip(axes, CONTROLLERS, strict=True):
+        for number, how in enumerate(ROWS):
+            for place, model in enumerate(ACROBOT):
+                own = rows[(rows["rows"] == how) & (rows["model"] == model) & (rows["test"] == test)]
+                values = own.groupby("left_out")["nmse"].agg(geometric)
+                height = np.full(len(values), place + 0.14 * (2 * number - 1))
+                label = how if place == 0 and axis is axes[0] else None
+                axis.plot(values, height, "o", markersize=5, color=harness.PALETTE[number], alpha=0.8, label=label)
+        axis.set(title=test, xlabel="error / variance of the change", yticks=range(len(ACROBOT)), yticklabels=ACROBOT)
+        harness.logarithmic(axis, "x")
+    axes[0].invert_yaxis()
+    harness.legend(figure, ncols=2)
+    harness.save_picture(figure, path)
 
 
 # --- contact -------------------------------------------------------------------------------------------------------
@@ -534,8 +655,9 @@ def check_tables(rows: pd.DataFrame) -> harness.Tables:
 
 def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
     if part == "contact":
-        # The UR10 and the KR300 have too few moves to fit and to judge monitors on.
-        machines = [name for name in machines if name not in ("UR10", "KR300", "double pendulum, 15 Hz")]
+        # The UR10, the KR300 and the Panda have too few moves to fit and to judge monitors on.
+        machines = [name for name in machines if name.split(",")[0] not in ("UR10", "KR300", "Panda")]
+        machines = [name for name in machines if name != "double pendulum, 15 Hz"]
         last = 1 if size == "quick" else None
         return [Contact(machine, move, size) for machine in machines for move in contact_split(machine)[1][:last]]
     if part == "check":
@@ -546,6 +668,9 @@ def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
             if len(trained) > 2
             for move in (*tested, *LOADED.get(machine, ()))
         ]
+    if part == "acrobot":
+        lefts = [f"tvlqr_{number}" for number in ((1,) if size == "quick" else (1, 2, 3))]
+        return [Acrobot(how, left, model, size) for how in ROWS for left in lefts for model in ACROBOT]
     if part == "forward":
         machines = [machine for machine in machines if machine in ("double pendulum, 15 Hz", "simple pendulum")]
         return [Forward(m, split, model, size) for m in machines for split in MACHINES[m].splits for model in FORWARD]
@@ -557,6 +682,7 @@ def cells_of(part: str, machines: list[str], size: str) -> list[Any]:
 PARTS = {  # CSV, function, tables, title
     "inverse": ("machines", run_inverse, inverse_tables, "Torques of machines on new moves"),
     "forward": ("machines_forward", run_forward, forward_tables, "Motion of machines"),
+    "acrobot": ("machines_acrobot", run_acrobot, acrobot_tables, "Motion of an acrobot under another controller"),
     "contact": ("machines_contact", run_contact, contact_tables, "Detection of contact"),
     "check": ("machines_check", run_check, check_tables, "Logs that do not fit the model"),
 }
@@ -611,7 +737,12 @@ def main() -> None:
         raise SystemExit(f"There are no logs for {options.part} in {options.data}.")
     if options.part == "inverse":
         plot(rows, output.with_suffix(".png"))
-    harness.write_page(title, tables_of(rows), output, n_failures)
+    if options.part == "acrobot":
+        plot_acrobot(rows, output.with_suffix(".png"))
+    tables, before = tables_of(rows), output.with_name(f"{output.stem}_before.csv")
+    if options.part == "inverse" and before.exists():
+        tables["before"] = against(rows, harness.frame(before, size=options.size))
+    harness.write_page(title, tables, output, n_failures)
 
 
 if __name__ == "__main__":

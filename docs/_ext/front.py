@@ -1,4 +1,4 @@
-"""Pictures of the front page: two from the benchmarks' CSVs, one from a small fit. Each is as wide as a card."""
+"""Pictures of the front page: three from the benchmarks' CSVs, one from a small fit. Each is as wide as a card."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -90,10 +90,32 @@ def arm() -> Figure:
     return figure
 
 
+def acrobot() -> Figure:
+    """Draw errors of the next state of a real acrobot under a controller that is not in the training data."""
+    models = {
+        "RES": "without physics",
+        "IFG": "InertiaForceGravity",
+        "IF, nominal, friction": "URDF",
+        "IF, nominal with parameters, friction": "URDF, masses\nlearned",
+    }
+    rows = rows_of(RESULTS / "machines_acrobot.csv")
+    rows = [row for row in rows if (row["rows"], row["test"]) == ("aligned", "another controller")]
+    means = [geometric_mean(float(row["nmse"]) for row in rows if row["model"] == model) for model in models]
+    figure, ax = plt.subplots(figsize=SIZE)
+    bars = ax.barh(list(models.values()), means, color=[ORANGE] + [BLUE] * 3)
+    ax.bar_label(bars, [f"{mean:.2g}" for mean in means], padding=3)
+    ax.invert_yaxis()
+    ax.grid(axis="y", visible=False)
+    ax.set_xlim(right=1.2 * max(means))
+    ax.set_xlabel("mean square error / variance of the change")
+    return figure
+
+
 PICTURES: dict[str, Callable[[], Figure]] = {
     "front_physics": physics,
     "front_rollout": angle_of_the_pole,
     "front_arm": arm,
+    "front_acrobot": acrobot,
 }
 
 
