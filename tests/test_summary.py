@@ -101,7 +101,9 @@ def test_torques_say_what_all_joints_share_and_what_is_of_each():
     assert weights.index.tolist() == m.coef_names_.tolist()
     assert numbers(summary.to_frame(), "noise std").value.tolist() == [m.noise_variance_[0] ** 0.5]
     assert m.residual_std_ > 0.0  # left-out rows say that the Gaussian process is worth its place
-    assert numbers(summary.to_frame(), "signal std").value.tolist() == pytest.approx(m.residual_std_)
+    signal, share = (numbers(summary.to_frame(), part).value.to_numpy() for part in ("signal std", "share"))
+    np.testing.assert_array_equal(share, m.residual_share_)
+    np.testing.assert_allclose(share * signal, m.residual_std_)
     assert summary.certificate == ""
     assert "What was learned" in m._repr_html_()
 

@@ -248,6 +248,7 @@ def of_inverse_dynamics(model: Any, joints: Sequence[str]) -> ModelSummary:
             kernels[joint] = str(residual.kernel_)
             columns = _OF_A_JOINT if model._has_robot else _kernel_columns(residual)
             numbers += _of_kernel(residual.kernel_, joint, columns)
+            numbers.append(Parameter(joint, "share", "", float(model.residual_share_[index])))
         numbers.append(Parameter(joint, "noise std", "", float(np.sqrt(model.noise_variance_[index]))))
         if model.standing_std_[index] > 0.0:
             numbers.append(Parameter(joint, "at rest", "", float(model.standing_std_[index])))
