@@ -119,8 +119,9 @@ def test_usual_differences_between_days_widen_intervals_of_another_day():
     usual = InverseDynamics("pendulum", n_inducing=0).fit(X, y, groups=moves)
     assert inside(only_moves) < 0.7 < 0.9 < inside(usual)
     assert (usual.move_scale_ >= only_moves.move_scale_).all()
-    with pytest.raises(ValueError, match="move_scale_prior must be 4 numbers >= 0"):
-        InverseDynamics("pendulum", move_scale_prior=[0.1, 0.1]).fit(X, y)
+    for wrong in ([0.1, 0.1], [0.1, 0.1, 0.1, -0.1], [np.nan] * 4, [None] * 4, [1e160] * 4):
+        with pytest.raises(ValueError, match="move_scale_prior must be 4 numbers from 0 to 1e"):
+            InverseDynamics("pendulum", move_scale_prior=wrong).fit(X, y)
 
 
 def test_torques_of_a_new_trajectory_are_known_to_a_hundredth(arm, rigid):

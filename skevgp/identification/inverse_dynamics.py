@@ -54,6 +54,8 @@ _SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
 # Rows below the speed v_s count less for f_j, and v_s is at most this value. Filters also blur the sign of friction at
 # higher speeds, but there f_j learns the average friction.
 _SHARP = 0.01
+# Largest prior standard deviation of effects of moves, in units of friction and of the gain.
+_LARGEST_MOVE_SCALE = 1e6
 
 
 class InverseDynamics(RegressorMixin, IdentifiedRobot):
@@ -89,9 +91,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         each kind of friction (`RigidBodyRegressor.coef_groups`). A machine that is much heavier than its model needs
         it. Factors of friction are from 1e-4 to 1e4, that of inertial parameters from 1 to 1e4.
     move_scale_prior : array-like of shape (4,), default=(0.015, 0.05, 0.04, 0.007)
-        Standard deviations between days, which are added to the differences between training moves: of the offset over
-        Coulomb friction, of viscous and of Coulomb friction over itself, and of the gain. The default is what arms
-        show. With zeros, only the training moves count.
+        Standard deviations between days, at most 1e6, which are added to the differences between training moves: of the
+        offset over Coulomb friction, of viscous and of Coulomb friction over itself, and of the gain. The default is
+        what arms show. With zeros, only the training moves count.
     n_inducing : int, default=40
         Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
@@ -130,7 +132,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     residual_share_ : ndarray of shape (n_outputs,)
         Shares a_j.
     correlation_time_ : ndarray of shape (n_outputs,)
-        Number of rows with as much information on the weights as one independent row.
+        Number of rows with as much information on the weights as one independent row. Joints of a robot have the same.
     inflation_ : float
         Factor by which groups differ more than ``correlation_time_`` explains, at least 1. The information of all rows
         is divided by it.
@@ -293,8 +295,12 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
         self._move_scale_prior = as_floats(self.move_scale_prior, "move_scale_prior")
-        if self._move_scale_prior.shape != (len(EFFECTS),) or (self._move_scale_prior < 0.0).any():
-            raise ValueError(f"move_scale_prior must be {len(EFFECTS)} numbers >= 0; got {self.move_scale_prior!r}.")
+        is_valid = (self._move_scale_prior >= 0.0) & (self._move_scale_prior <= _LARGEST_MOVE_SCALE)
+        if is_valid.shape != (len(EFFECTS),) or not is_valid.all():
+            raise ValueError(
+                f"move_scale_prior must be {len(EFFECTS)} numbers from 0 to {_LARGEST_MOVE_SCALE:g}; got "
+                f"{self.move_scale_prior!r}."
+            )
         self._one_dimensional = targets.ndim == 1
         targets = targets.reshape(len(targets), -1)
         check_magnitude(rows_x, "X")

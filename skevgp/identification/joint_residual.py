@@ -29,10 +29,15 @@ _SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 3.0
 _LEAST = 1e-6
 # Least share of the variance of held-out errors that is noise and not the uncertainty of f.
 _OWN = 0.05
+# Part of the variance of the weights in held-out errors that counts as noise.
+_AS_NOISE = 0.5
 # Limits of rows and iterations of a fit that leaves a move out.
 _ROWS_OF_TRIAL, _ITERATIONS_OF_TRIAL = 500, 20
-# Candidates of the share of f. Smaller shares are 0.
-_SHARES, _SMALLEST_SHARE = np.linspace(0.0, 1.0, 11), 0.02
+# Candidates of the share of f. Smaller shares are 0. If no share changes the mean square error of a held-out move by
+# more than the last number, relative to it, f is 0.
+_SHARES, _SMALLEST_SHARE, _NO_CHANGE = np.linspace(0.0, 1.0, 11), 0.02, 1e-3
+# Mean square errors of a move are at least this part of the mean over moves.
+_LEAST_SQUARE = 1e-6
 # A held-out move counts as at most this number of independent rows.
 _MOST_OF_MOVE = 10.0
 # Moves differ more than their scatter shows, because few are held out. So its variance is multiplied by the first
@@ -115,15 +120,16 @@ def fit_joint_residual(
 
     def with_moves(model: QuietRegressor | None, share: float, missed: np.ndarray, own: np.ndarray) -> JointResidual:
         # The variance of errors is the sum of own (n,), the variance of f, of known (n,), that of the weights, of the
-        # variance of effects of moves, and of noise.
-        own = own + known
+        # variance of effects of moves, and of noise. A part of the variance of the weights counts as noise, because
+        # errors of new moves are larger than those of held-out ones.
+        own, as_noise = own + (1.0 - _AS_NOISE) * known, _AS_NOISE * known
         found = likeliest_noise(missed, speed, noise.coulomb, noise.velocity, least)
         left = found.variance - float(np.mean(own * found.variance / found.of(speed)))
         floor = _OWN * found.variance if model is not None else noise.variance
         found = found._replace(variance=max(left, floor))
         z = terms(speed, physics, found.velocity)
         effects, update, found = variation(z, missed, speed, found, own, rows, usual)
-        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own)
+        squares = missed**2 / (found.of(speed) + effects.moments(z)[1] + own + as_noise)
         logs = [np.log(max(float(np.mean(squares[rows.groups == move])), 1e-300)) for move in np.unique(rows.groups)]
         return JointResidual(model, found, share, effects, update, effects, np.array(logs))
 
@@ -165,13 +171,16 @@ def _share(missed: np.ndarray, mean: np.ndarray, relative: np.ndarray, moves: np
     # -n/2 log(mean square). Its sum over moves gives the posterior mean of a, with a uniform prior.
     #
     # A new move may differ from all held-out ones. If the mean fall of log(mean square) over moves is m, with the
-    # standard error s, the share of m that is not scatter is 1 - s² / m² (James & Stein 1961). The posterior mean is
-    # multiplied by it.
+    # standard error s, the part of m that is not scatter is about 1 - s² / m² (James & Stein 1961), or 0. Here s²
+    # counts _SCATTER times. A part of the posterior mean is kept, and the rest is multiplied by the part of m.
     groups = [moves == move for move in np.unique(moves)]
     if len(groups) < 2:
         return 0.0
     squares = np.array([[np.mean((missed - a * mean)[own] ** 2 / relative[own]) for own in groups] for a in _SHARES])
-    falls = np.log(np.maximum(squares, 1e-300)) - np.log(np.maximum(squares[0], 1e-300))  # (shares, moves)
+    least = max(_LEAST_SQUARE * float(squares[0].mean()), 1e-300)
+    falls = np.log(np.maximum(squares, least)) - np.log(np.maximum(squares[0], least))  # (shares, moves)
+    if np.abs(falls).max() < _NO_CHANGE:
+        return 0.0
     time = correlation_time((missed - 0.5 * mean) / np.sqrt(relative), moves)
     worth = np.minimum([own.sum() / time for own in groups], _MOST_OF_MOVE)
     share = float(softmax(-0.5 * falls @ worth) @ _SHARES)

@@ -93,3 +93,7 @@ def test_share_is_that_of_left_out_moves_and_little_by_chance():
     # All moves agree, so the small improvement is real.
     assert np.mean([share(0.5, [1.0]) for _ in range(100)]) > 0.25
     assert _share(np.ones(10), np.ones(10), np.ones(10), np.zeros(10)) == 0.0  # nothing was held out
+    assert _share(rng.normal(size=200), np.zeros(200), np.ones(200), moves) == 0.0
+    # Errors of exactly 0 in one move do not decide alone.
+    mean = rng.normal(size=200)
+    assert _share(np.where(moves == 0, 0.0, 3.0 * mean), np.where(moves == 0, 1e-9, mean), np.ones(200), moves) > 0.8

@@ -30,6 +30,9 @@ _STICTION = 0.05  # rad/s or m/s, within which Coulomb friction changes its sign
 _DEPENDENT = 1e-8  # of the largest singular value: below it, parameters have no effect of their own
 _CLEAR = 10.0  # nats that a delay gains over none; below it, there is none
 _LEAST_SHARE = 1e-15  # of the variance of efforts: rounding
+# The delay of velocities: length of windows, s; the fewest windows; limits, in rows, and in s or rows; standard errors
+# above 0 of a clear delay.
+_WINDOW, _FEWEST, _LEAST_LATE, _LONGEST_LATE, _LATE_ROWS, _CLEARLY = 0.1, 20, 0.1, 0.1, 1.5, 5.0
 
 
 def check_delay(delay: Any, n_joints: int) -> np.ndarray:
@@ -38,6 +41,42 @@ def check_delay(delay: Any, n_joints: int) -> np.ndarray:
     if values.shape not in ((), (n_joints,)) or not np.isfinite(values).all():
         raise ValueError(f"delay must be a finite number, or one for each of the {n_joints} joints; got {delay!r}.")
     return np.broadcast_to(values, n_joints).copy()
+
+
+def integral(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return the integral of samples (n, k) by the trapezoidal rule, (n, k)."""
+    steps = np.diff(time)[:, np.newaxis]
+    return np.vstack([np.zeros_like(signal[:1]), np.cumsum(0.5 * (signal[1:] + signal[:-1]) * steps, axis=0)])
+
+
+def velocity_delays(time: np.ndarray, position: np.ndarray, velocity: np.ndarray, moving: list[slice]) -> np.ndarray:
+    """Return the time by which velocities (n, n_joints) are later than positions, (n_joints,), s; 0 if none is clear.
+
+    ``moving`` are runs of steps without gaps and rest. A joint whose delay is uncertain has the median of the others.
+    """
+    # With v(t) = q̇(t - d), the change of position in a window is ∫ v dt + d Δv to first order. So d is the slope of the
+    # difference over Δv.
+    n_joints, step = position.shape[1], float(np.median(np.diff(time)))
+    length = max(1, round(_WINDOW / step))
+    starts = np.array([start for run in moving for start in range(run.start, run.stop - length + 1)], dtype=np.intp)
+    if len(starts) < _FEWEST:
+        return np.zeros(n_joints)
+    ends = starts + length
+    total = integral(time, velocity)
+    with np.errstate(all="ignore"):
+        change = velocity[ends] - velocity[starts]
+        missed = position[ends] - position[starts] - (total[ends] - total[starts])
+        information = np.sum(change**2, axis=0)
+        delays = np.sum(missed * change, axis=0) / information
+        # Windows overlap, so fewer than all are independent.
+        errors = np.sqrt(np.mean((missed - delays * change) ** 2, axis=0) * length / information)
+    least, longest = _LEAST_LATE * step, max(_LONGEST_LATE, _LATE_ROWS * step)
+    known = np.isfinite(delays) & np.isfinite(errors)
+    late = known & (delays > least) & (delays < longest) & (delays > _CLEARLY * errors)
+    if not late.any():
+        return np.zeros(n_joints)
+    uncertain = ~late & ~(known & (_CLEARLY * errors < least))
+    return np.where(late, delays, np.where(uncertain, np.median(delays[late]), 0.0))
 
 
 @dataclass(frozen=True)
@@ -75,16 +114,27 @@ class RecordedRobot:
 
 def estimate_delay(
     raw: Signals, step: float, gap: float, how: Processing, breaks: Sequence[Break], robot: RecordedRobot
-) -> float:
-    """Return the delay of the efforts of a sorted recording, one for all joints, s; 0 if none is clear."""
+) -> float | None:
+    """Return the delay of the efforts of a sorted recording, one for all joints, s; None if the log does not tell.
+
+    If velocities are late, it is the delay of the efforts behind them.
+    """
     how.check_frequencies(step)
     cutoff = min(_CUTOFF, 0.2 / step) if how.cutoff is None else how.cutoff
     how = replace(how, cutoff=cutoff, dt=max(step, 1.0 / (_ROWS * cutoff)))
+    if raw.velocity is not None:
+        moving = [slice(rows.start, rows.stop - 1) for rows in pieces(raw.time, gap, breaks)]
+        lags = velocity_delays(raw.time, raw.position, raw.velocity, moving)
+        earlier = [np.interp(raw.time - lag, raw.time, q) for lag, q in zip(lags, raw.position.T, strict=True)]
+        raw = replace(raw, position=np.column_stack(earlier))
     fit = _Regressions.of(raw, step, gap, how, breaks, robot)
     if fit is None:
-        return 0.0
+        return None
     tried = np.linspace(-_LARGEST, _LARGEST, _COARSE)
-    best = int(np.argmin(fit.deviances(tried)))
+    deviances = fit.deviances(tried)
+    best = int(np.argmin(deviances))
+    if max(deviances[0], deviances[-1]) - deviances[best] < _CLEAR:
+        return None
     near = tried[best] + (tried[1] - tried[0]) * np.linspace(-1.0, 1.0, _FINE)
     deviances = fit.deviances(np.append(near, 0.0))
     lowest = 1 + int(np.argmin(deviances[1:-2]))  # with a neighbour on both sides

@@ -392,9 +392,10 @@ def _recording(
         of_file, raw = raw, motors.joints(raw)
         parts, wrapped = list(pieces(raw.time, gap, breaks)), motors.steps_of_joints(found.wrapped)
         _check_derivatives(raw, parts, names, wrapped, how)
-        is_estimated = isinstance(delay, RecordedRobot)
+        is_estimated = False
         if isinstance(delay, RecordedRobot):
-            delay = np.full(len(names), estimate_delay(raw, step, gap, how, breaks, delay))
+            found_delay = estimate_delay(raw, step, gap, how, breaks, delay)
+            is_estimated, delay = found_delay is not None, np.full(len(names), found_delay or 0.0)
         done = process(raw, step, gap, how, breaks, delay if delay.any() else None)
     for name, signal in vars(done.signals).items():
         if not np.isfinite(signal).all():

@@ -8,10 +8,9 @@ import numpy as np
 from sklearn.utils import Bunch
 
 from ...utils.validation import check_integer
+from .delay import integral, velocity_delays
 from .signals import runs
 
-# The delay of velocities: length of windows, s; the fewest windows; limits, in rows and s; standard errors above 0.
-_WINDOW, _FEWEST, _LEAST_DELAY, _LONGEST_DELAY, _CLEAR = 0.1, 20, 0.1, 0.1, 5.0
 # From this stride on, velocities are averaged.
 _AVERAGED = 4
 
@@ -32,11 +31,11 @@ def log_transitions(
     gap, a jump of a position, a corrupt value, a repeated frame or rest are left out, and so are rows with the time of
     another row.
 
-    Velocities of many drives are differences of positions, and so they are late by half a row or more. This delay is
-    found from positions and velocities, and positions are taken earlier by it (``align``). If `load_log` had a
-    ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay. With
-    ``delay="auto"``, efforts and velocities belong together, whether the drive records the torque to come or the last
-    one. Use it if rows are far apart, and pass the robot.
+    Velocities of many drives are differences of positions, and so they are late by half a row or more. The delay of
+    each joint is found from positions and velocities, and positions are taken earlier by it (``align``). If `load_log`
+    had a ``delay``, the torque of a transition is the mean of the efforts that were recorded later by this delay. With
+    ``delay="auto"`` and the robot, it is the torque that acted, whether the drive records the torque to come or the
+    last one. That matters if rows are far apart.
     :doc:`Learn the next state from your own logs </howto/next_state>` has an example, and one without velocities.
 
     Parameters
@@ -63,7 +62,8 @@ def log_transitions(
         - ``target`` : ndarray of shape (n_rows, 2 * n_joints), with positions and velocities after ``dt``;
         - ``groups`` : ndarray of shape (n_rows,), with the file of each row;
         - ``time`` : ndarray of shape (n_rows,), in s since the first row of the file;
-        - ``velocity_delay`` : ndarray of shape (n_files,), time by which velocities are late, s;
+        - ``velocity_delay`` : ndarray of shape (n_files, n_joints), time by which velocities are late, s. States are
+          earlier than ``time`` by the largest one of their file;
         - ``joint_names``, ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
         Returned only if ``return_X_y`` is True.
@@ -73,7 +73,7 @@ def log_transitions(
     ValueError
         If ``stride`` is below 1, the log has no recorded velocities, or no transition remains.
     TypeError
-        If ``log`` is not a result of `load_log`, or ``stride`` is not an integer.
+        If ``log`` is not a result of `load_log`, ``stride`` is not an integer, or ``align`` is not a boolean.
 
     See Also
     --------
@@ -106,9 +106,11 @@ def log_transitions(
     True
     """
     check_integer(stride, "stride", minimum=1)
+    if not isinstance(align, (bool, np.bool_)):
+        raise TypeError(f"align must be True or False; got {align!r}.")
     if not isinstance(log, Bunch) or "recordings" not in log:
         raise TypeError(f"log must be a result of load_log; got {type(log).__name__}.")
-    delays = [_velocity_delay(recording) if align else 0.0 for recording in log.recordings]
+    delays = [_velocity_delays(recording, align) for recording in log.recordings]
     parts = [
         _transitions(recording, stride, delay, align) for recording, delay in zip(log.recordings, delays, strict=True)
     ]
@@ -161,6 +163,14 @@ def _velocities(recording: Bunch) -> np.ndarray:
     return np.asarray(recording.raw.velocity)
 
 
+def _velocity_delays(recording: Bunch, align: bool) -> np.ndarray:
+    """Return the time by which the velocity of each joint is later than its position, s."""
+    velocity = _velocities(recording)
+    if not align:
+        return np.zeros(velocity.shape[1])
+    return velocity_delays(recording.raw.time, recording.raw.position, velocity, list(runs(_whole(recording))))
+
+
 def _whole(recording: Bunch) -> np.ndarray:
     """Return whether there is motion without a fault from a row to the next, (n - 1,)."""
     time = recording.raw.time
@@ -171,86 +181,65 @@ def _whole(recording: Bunch) -> np.ndarray:
     return whole
 
 
-def _integral(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Return the integral of samples (n, k) by the trapezoidal rule, (n, k)."""
-    steps = np.diff(time)[:, np.newaxis]
-    return np.vstack([np.zeros_like(signal[:1]), np.cumsum(0.5 * (signal[1:] + signal[:-1]) * steps, axis=0)])
-
-
 def _at(times: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
     """Return signals (n, k) at other times, by linear interpolation."""
     return np.column_stack([np.interp(times, time, column) for column in signal.T])
 
 
 def _averaged(time: np.ndarray, signal: np.ndarray, at: np.ndarray, half: float) -> np.ndarray:
-    """Return means of a signal (n, k) over times around some of its rows, up to this half width within the signal."""
+    """Return means of a signal (n,) over times around others, up to this half width within the signal."""
     width = np.minimum(half, np.minimum(at - time[0], time[-1] - at))
-    integral = _integral(time, signal)
-    change = _at(at + width, time, integral) - _at(at - width, time, integral)
-    found = _at(at, time, signal)
+    found = np.interp(at, time, signal)
     inside = width > 0.0
-    found[inside] = change[inside] / (2.0 * width[inside, np.newaxis])
+    if inside.any():
+        total = integral(time, signal[:, np.newaxis])[:, 0]
+        change = np.interp(at + width, time, total) - np.interp(at - width, time, total)
+        found[inside] = change[inside] / (2.0 * width[inside])
     return found
 
 
-def _velocity_delay(recording: Bunch) -> float:
-    """Return the time by which velocities are later than positions, s; 0 if none is clear."""
-    # With v(t) = q̇(t - d), the change of position in a window is ∫ v dt + d Δv to first order. So d is the slope of the
-    # difference over Δv.
-    velocity, time = _velocities(recording), recording.raw.time
-    step = float(np.median(np.diff(time)))
-    length = max(1, round(_WINDOW / step))
-    moving = np.array([start for run in runs(_whole(recording)) for start in range(run.start, run.stop - length + 1)])
-    if len(moving) < _FEWEST:
-        return 0.0
-    integral = _integral(time, velocity)
-    ends = moving + length
-    change = velocity[ends] - velocity[moving]
-    missed = recording.raw.position[ends] - recording.raw.position[moving] - (integral[ends] - integral[moving])
-    total = float(np.sum(change**2))
-    if total == 0.0 or not np.isfinite([total, np.sum(missed**2)]).all():
-        return 0.0
-    delay = float(np.sum(missed * change)) / total
-    # Windows overlap, so fewer than all are independent.
-    error = np.sqrt(float(np.mean((missed - delay * change) ** 2)) * length / total)
-    return delay if _LEAST_DELAY * step < delay < _LONGEST_DELAY and delay > _CLEAR * error else 0.0
-
-
-def _transitions(recording: Bunch, stride: int, lag: float, align: bool) -> np.ndarray:
+def _transitions(recording: Bunch, stride: int, lags: np.ndarray, align: bool) -> np.ndarray:
     """Return rows of state, torque, dt, next state and time."""
     raw, velocity, whole = recording.raw, _velocities(recording), _whole(recording)
     time, steps = raw.time, np.diff(raw.time)
-    # Efforts that act in a step were recorded later by their delay. An estimated delay is that of efforts at the rows
-    # behind velocities. Any other delay is that of efforts which are held until the next row, behind positions.
-    late = np.append(recording.delay, 0.0) - (0.0 if recording.delay_is_estimated else lag)
+    step, lag = float(np.median(steps)), float(lags.max())
+    # Efforts that act in a step were recorded later by their delay, and they are held until the next row. An estimated
+    # delay is that of the efforts in the middle of the time for which they are held, behind velocities. Any other delay
+    # is that of their beginning, behind positions.
+    is_estimated = recording.get("delay_is_estimated", False)
+    late = np.append(recording.delay + 0.5 * step if is_estimated else recording.delay - lag, 0.0)
     for first, last, why in recording.cuts:
         if why == "gap":
             whole &= (time[1:] + late.max() <= first) | (time[:-1] + late.min() >= last)
     whole &= (time[:-1] + late.min() >= time[0]) & (time[1:] + late.max() <= time[-1])
-    if recording.delay_is_estimated:
-        impulse = _integral(time, raw.torque)
-    else:
-        impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
-    n_late = int(np.ceil(lag / np.median(steps))) if lag else 0
+    impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
     found = []
+    beginnings = np.array([run.start for run in runs(_whole(recording))])
     for run in runs(whole):
-        starts = np.arange(run.start + n_late, run.stop - stride + 1, stride)
+        # Earlier rows of the same motion have the positions before the first state.
+        begin = int(beginnings[np.searchsorted(beginnings, run.start, side="right") - 1])
+        first = max(run.start, int(np.searchsorted(time, time[begin] + lag)))
+        starts = np.arange(first, run.stop - stride + 1, stride)
         if not len(starts):
             continue
         rows = np.append(starts, starts[-1] + stride)
-        of_run = slice(run.start, run.stop + 1)
-        positions, speeds = raw.position[rows], velocity[rows]
-        if lag:
-            positions = _at(time[rows] - lag, time[of_run], raw.position[of_run])
-        if align and stride >= _AVERAGED:
-            speeds = _averaged(time[of_run], velocity[of_run], time[rows], 0.25 * stride * float(np.median(steps)))
+        own = slice(begin, run.stop + 1)
+        # All states are of the time of the latest velocity.
+        positions = _at(time[rows] - lag, time[own], raw.position[own]) if lag else raw.position[rows]
+        half = 0.25 * stride * step if align and stride >= _AVERAGED else 0.0
+        speeds = np.column_stack(
+            [
+                _averaged(time[own], velocity[own, joint], time[rows] - (lag - delay), half)
+                for joint, delay in enumerate(lags)
+            ]
+        )
         states = np.hstack([positions, speeds])
         dt = np.diff(time[rows])[:, np.newaxis]
-        if late[:-1].any() or recording.delay_is_estimated:
+        if late[:-1].any():
             torque = np.column_stack(
                 [
-                    np.diff(np.interp(time[rows] + delay, time, own))
-                    for delay, own in zip(late[:-1], impulse.T, strict=True)
+                    np.diff(np.interp(time[rows] + delay, time, column))
+                    for delay, column in zip(late[:-1], impulse.T, strict=True)
                 ]
             )
             torque /= dt

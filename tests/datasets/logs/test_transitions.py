@@ -88,30 +88,53 @@ def test_positions_are_taken_at_the_time_of_late_velocities(load, rows_late):
     assert_array_equal(log_transitions(load(table, rest_velocity=0.0), align=False).velocity_delay, 0.0)
 
 
+@pytest.mark.parametrize("n_held", [1, 2, 4])
+@pytest.mark.parametrize("are_late", [False, True])
 @pytest.mark.parametrize("recorded", ["next", "last"])
-def test_with_an_estimated_delay_the_torque_is_that_of_the_transition(tmp_path, recorded):
-    """A pendulum with a held torque. Velocities are differences of positions, as those of many drives."""
+def test_with_an_estimated_delay_the_torque_is_that_of_the_transition(tmp_path, recorded, are_late, n_held):
+    """A pendulum with held torques. Late velocities are differences of positions, as those of many drives."""
     rng, h = np.random.default_rng(0), 0.03
-    held = np.repeat(rng.uniform(-3.0, 3.0, 200), 2)
-    fine, state = [], np.array([[0.3, 0.0]])
-    for u in held:
-        way = simulate("pendulum", state, np.full((1, 30, 1), u), h / 30.0)[0]
-        state = way[-1:]
-        fine.append(way[0])
-    q = np.array(fine)[:, 0]
-    velocity = np.diff(q, prepend=q[0]) / h
+    held = np.repeat(rng.uniform(-3.0, 3.0, 400 // n_held), n_held)
+    inputs = np.repeat(held, 30)[np.newaxis, :, np.newaxis]
+    q, velocity = simulate("pendulum", np.array([[0.3, 0.0]]), inputs, h / 30.0)[0, :-1:30].T
+    if are_late:
+        velocity = np.diff(q, prepend=q[0]) / h
     effort = held if recorded == "next" else np.append(0.0, held[:-1])
     table = np.column_stack([h * np.arange(len(q)), q, velocity, effort])[1:]
-    file = write_table(tmp_path / "log.csv", table)
     columns = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
     with ignored(category=RobotModelWarning):
-        log = load_log(file, columns=columns, robot="pendulum", delay="auto", wrap=False, cutoff=10.0)
+        log = load_log(
+            write_table(tmp_path / "log.csv", table), columns=columns, robot="pendulum", delay="auto", wrap=False
+        )
     found = log_transitions(log)
-    assert_allclose(found.velocity_delay, h / 2.0, rtol=0.05)
-    # States are those at half of a row before. So each transition has half of two torques.
-    middle = np.searchsorted(table[:, 0], found.time + table[0, 0] - 1e-6) + 1
-    assert_allclose(found.data[:, 2], 0.5 * (held[middle - 1] + held[middle]), atol=0.6)
-    assert np.corrcoef(found.data[:, 2], 0.5 * (held[middle - 1] + held[middle]))[0, 1] > 0.98
+    assert_allclose(found.velocity_delay, h / 2.0 if are_late else 0.0, rtol=0.05)
+    row = np.searchsorted(table[:, 0], found.time + table[0, 0] - 1e-6) + 1
+    # Late states are those at half of a row before. So each transition has half of two torques.
+    truth = 0.5 * (held[row - 1] + held[row]) if are_late else held[row]
+    assert np.sqrt(np.mean((found.data[:, 2] - truth) ** 2)) < 0.15 * truth.std()
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_velocities_of_each_joint_have_their_own_delay(load, unit):
+    t, late = 0.03 * np.arange(400), np.array([0.015, 0.0])
+    table = table_of(t)
+    table[:, 4] = motion(t - 0.015)[1][:, 0]
+    table[:, [2, 5]] *= unit
+    found = log_transitions(load(table, rest_velocity=0.0, wrap=False))
+    assert_allclose(found.velocity_delay, [late], atol=5e-4)
+    states, _, _, _ = parts(found)
+    q, dq, _, _ = motion(found.time + t[0] - 0.015)
+    states[:, [1, 3]] /= unit
+    assert_allclose(states, np.hstack([q, dq]), atol=1e-2)  # by linear interpolation
+
+
+def test_late_velocities_cost_one_row_of_each_motion(load):
+    t = 0.03 * np.arange(400)
+    table = table_of(t)
+    table[:, 4:6] = motion(t - 0.015)[1]
+    log = load(np.delete(table, [200], axis=0), rest_velocity=0.0, max_gap=0.04)
+    assert len(log_transitions(log, align=False).data) == 397
+    assert len(log_transitions(log).data) == 395
 
 
 @pytest.mark.parametrize("stride", [1, 3])
@@ -167,6 +190,8 @@ def test_invalid_arguments_raise(load):
         log_transitions(log, stride=0)
     with pytest.raises(TypeError, match="stride must be an integer; got 1.5"):
         log_transitions(log, stride=1.5)
+    with pytest.raises(TypeError, match="align must be True or False; got 'no'"):
+        log_transitions(log, align="no")
     for wrong in ("log.csv", Bunch(data=log.data)):
         with pytest.raises(TypeError, match="log must be a result of load_log; got"):
             log_transitions(wrong)
