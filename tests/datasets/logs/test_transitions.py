@@ -1,3 +1,5 @@
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -88,15 +90,21 @@ def test_positions_are_taken_at_the_time_of_late_velocities(load, rows_late):
     assert_array_equal(log_transitions(load(table, rest_velocity=0.0), align=False).velocity_delay, 0.0)
 
 
+@cache
+def pushed(n_held, h):
+    """A pendulum with torques that are held for some rows of h seconds: torques, angles and velocities."""
+    held = np.repeat(np.random.default_rng(0).uniform(-3.0, 3.0, 240 // n_held), n_held)
+    inputs = np.repeat(held, 10)[np.newaxis, :, np.newaxis]
+    return held, *simulate("pendulum", np.array([[0.3, 0.0]]), inputs, h / 10.0)[0, :-1:10].T
+
+
 @pytest.mark.parametrize("n_held", [1, 2, 4])
 @pytest.mark.parametrize("are_late", [False, True])
 @pytest.mark.parametrize("recorded", ["next", "last"])
 def test_with_an_estimated_delay_the_torque_is_that_of_the_transition(tmp_path, recorded, are_late, n_held):
     """A pendulum with held torques. Late velocities are differences of positions, as those of many drives."""
-    rng, h = np.random.default_rng(0), 0.03
-    held = np.repeat(rng.uniform(-3.0, 3.0, 400 // n_held), n_held)
-    inputs = np.repeat(held, 30)[np.newaxis, :, np.newaxis]
-    q, velocity = simulate("pendulum", np.array([[0.3, 0.0]]), inputs, h / 30.0)[0, :-1:30].T
+    h = 0.03
+    held, q, velocity = pushed(n_held, h)
     if are_late:
         velocity = np.diff(q, prepend=q[0]) / h
     effort = held if recorded == "next" else np.append(0.0, held[:-1])
