@@ -84,7 +84,7 @@ def precise_first_joints(seed, robot, cutoff):
     return X, y + size * [0.001, 0.001, 0.05, 0.05, 0.05, 0.05] * noise / noise.std(axis=0)
 
 
-@pytest.mark.parametrize(("cutoff", "seed"), [(2.5, 0), (5.0, 1), (20.0, 2)])
+@pytest.mark.parametrize(("cutoff", "seed"), [(2.5, 0), (5.0, 1), (20.0, 0)])
 def test_no_joint_loses_to_least_squares_on_another_move(cutoff, seed):
     robot = perturb_robot("ur5", 0.2, random_state=seed)
     logs = [precise_first_joints(100 * seed + move, robot, cutoff) for move in range(4)]
