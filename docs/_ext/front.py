@@ -107,7 +107,7 @@ def acrobot() -> Figure:
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
     ax.set_xlim(right=1.2 * max(means))
-    ax.set_xlabel("mean square error / variance of the change")
+    ax.set_xlabel("error / variance of the change")
     return figure
 
 
