@@ -121,7 +121,7 @@ FIGURES = [
     ("which_model.md", "Gaussian process 4.2 times", "real_arms", r"\| GP \| 4\.23 \| 11\.3 \| 3\.07"),
     ("which_model.md", "a Gaussian process without physics | 4.23 | 11.3 | 3.07", "real_arms", r"\| GP \| 4\.23"),
     ("which_model.md", "| `InverseDynamics` | **0.57** | 1.07 | 0.31", "real_arms", r"\| EVGP \| 0\.569 \| 1\.07"),
-    ("which_model.md", "2.98 ± 0.23 kg (95 %)", "payload", r"14harm50sec \| 0\.1 \| 2\.983 ± 0\.227"),
+    ("which_model.md", "3.00 ± 0.24 kg (95 %)", "payload", r"14harm50sec \| 0\.1 \| 3\.000 ± 0\.242"),
     ("comparison.md", "`model.compile()` | 23 |", "latency", r"compiled: row, mean and std \| 23 "),
     ("comparison.md", "`predict` | 49 |", "latency", r"predict: row, mean and std \| 49 "),
     (
