@@ -68,6 +68,18 @@ def angle_of_the_pole() -> Figure:
     return figure
 
 
+def bars(names: list[str], values: list[float], colors: list[str], label: str) -> Figure:
+    """Draw a bar with its number for each name, from top to bottom."""
+    figure, ax = plt.subplots(figsize=SIZE)
+    drawn = ax.barh(names, values, color=colors)
+    ax.bar_label(drawn, [f"{value:.2g}" for value in values], padding=3)
+    ax.invert_yaxis()
+    ax.grid(axis="y", visible=False)
+    ax.set_xlim(right=1.2 * max(values))
+    ax.set_xlabel(label)
+    return figure
+
+
 def arm() -> Figure:
     """Draw mean square errors of torques of the UR10e over those of least squares."""
     models = {
@@ -80,14 +92,7 @@ def arm() -> Figure:
     rows = [row for row in rows_of(RESULTS / "real_arms.csv") if (row["robot"], row["split"]) == ("ur10e", "three")]
     rows = [row for row in rows if row["size"] == "full"]
     means = [geometric_mean(float(row["ratio"]) for row in rows if row["model"] == model) for model in models]
-    figure, ax = plt.subplots(figsize=SIZE)
-    bars = ax.barh(list(models.values()), means, color=[GREY] * 3 + [BLUE] * 2)
-    ax.bar_label(bars, [f"{mean:.2g}" for mean in means], padding=3)
-    ax.invert_yaxis()
-    ax.grid(axis="y", visible=False)
-    ax.set_xlim(right=1.15 * max(means))
-    ax.set_xlabel("mean square error / least squares'")
-    return figure
+    return bars([*models.values()], means, [GREY] * 3 + [BLUE] * 2, "mean square error / least squares'")
 
 
 def acrobot() -> Figure:
@@ -101,14 +106,7 @@ def acrobot() -> Figure:
     rows = rows_of(RESULTS / "machines_acrobot.csv")
     rows = [row for row in rows if (row["rows"], row["test"]) == ("aligned", "another controller")]
     means = [geometric_mean(float(row["nmse"]) for row in rows if row["model"] == model) for model in models]
-    figure, ax = plt.subplots(figsize=SIZE)
-    bars = ax.barh(list(models.values()), means, color=[ORANGE] + [BLUE] * 3)
-    ax.bar_label(bars, [f"{mean:.2g}" for mean in means], padding=3)
-    ax.invert_yaxis()
-    ax.grid(axis="y", visible=False)
-    ax.set_xlim(right=1.2 * max(means))
-    ax.set_xlabel("error / variance of the change")
-    return figure
+    return bars([*models.values()], means, [ORANGE] + [BLUE] * 3, "error / variance of the change")
 
 
 PICTURES: dict[str, Callable[[], Figure]] = {

@@ -132,7 +132,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     residual_share_ : ndarray of shape (n_outputs,)
         Shares a_j.
     correlation_time_ : ndarray of shape (n_outputs,)
-        Number of rows with as much information on the weights as one independent row. Joints of a robot have the same.
+        Number of rows with as much information on the weights as one independent row. All joints of a robot have the
+        same.
     inflation_ : float
         Factor by which groups differ more than ``correlation_time_`` explains, at least 1. The information of all rows
         is divided by it.

@@ -391,7 +391,7 @@ def _variances(noise: list[JointNoise], speed: np.ndarray) -> np.ndarray:
 
 
 def _solve(information: np.ndarray, score: np.ndarray, precision: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of z ~ N(0, I / precision) given e = B z + N(0, I), BᵀB and Bᵀe."""
+    """Return mean and covariance of z ~ N(0, I / precision), given BᵀB and Bᵀe of the model e = B z + N(0, I)."""
     # The posterior precision is scaled to a unit diagonal, so that priors of different widths do not lose accuracy.
     whole = precision * np.eye(len(information)) + information
     scale = np.sqrt(np.diag(whole))

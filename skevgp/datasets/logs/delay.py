@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 
 from ...robots import RigidBody
@@ -43,12 +44,6 @@ def check_delay(delay: Any, n_joints: int) -> np.ndarray:
     return np.broadcast_to(values, n_joints).copy()
 
 
-def integral(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Return the integral of samples (n, k) by the trapezoidal rule, (n, k)."""
-    steps = np.diff(time)[:, np.newaxis]
-    return np.vstack([np.zeros_like(signal[:1]), np.cumsum(0.5 * (signal[1:] + signal[:-1]) * steps, axis=0)])
-
-
 def velocity_delays(time: np.ndarray, position: np.ndarray, velocity: np.ndarray, moving: list[slice]) -> np.ndarray:
     """Return the time by which velocities (n, n_joints) are later than positions, (n_joints,), s; 0 if none is clear.
 
@@ -62,7 +57,7 @@ def velocity_delays(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     if len(starts) < _FEWEST:
         return np.zeros(n_joints)
     ends = starts + length
-    total = integral(time, velocity)
+    total = cumulative_trapezoid(velocity, time, axis=0, initial=0.0)
     with np.errstate(all="ignore"):
         change = velocity[ends] - velocity[starts]
         missed = position[ends] - position[starts] - (total[ends] - total[starts])

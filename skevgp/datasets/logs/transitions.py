@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Literal, overload
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from sklearn.utils import Bunch
 
 from ...utils.validation import check_integer
-from .delay import integral, velocity_delays
+from .delay import velocity_delays
 from .signals import runs
 
 # From this stride on, velocities are averaged.
@@ -192,7 +193,7 @@ def _averaged(time: np.ndarray, signal: np.ndarray, at: np.ndarray, half: float)
     found = np.interp(at, time, signal)
     inside = width > 0.0
     if inside.any():
-        total = integral(time, signal[:, np.newaxis])[:, 0]
+        total = cumulative_trapezoid(signal, time, initial=0.0)
         change = np.interp(at + width, time, total) - np.interp(at - width, time, total)
         found[inside] = change[inside] / (2.0 * width[inside])
     return found
@@ -201,6 +202,7 @@ def _averaged(time: np.ndarray, signal: np.ndarray, at: np.ndarray, half: float)
 def _transitions(recording: Bunch, stride: int, lags: np.ndarray, align: bool) -> np.ndarray:
     """Return rows of state, torque, dt, next state and time."""
     raw, velocity, whole = recording.raw, _velocities(recording), _whole(recording)
+    beginnings = np.array([motion.start for motion in runs(whole)])
     time, steps = raw.time, np.diff(raw.time)
     step, lag = float(np.median(steps)), float(lags.max())
     # Efforts that act in a step were recorded later by their delay, and they are held until the next row. An estimated
@@ -214,7 +216,6 @@ def _transitions(recording: Bunch, stride: int, lags: np.ndarray, align: bool) -
     whole &= (time[:-1] + late.min() >= time[0]) & (time[1:] + late.max() <= time[-1])
     impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
     found = []
-    beginnings = np.array([run.start for run in runs(_whole(recording))])
     for run in runs(whole):
         # Earlier rows of the same motion have the positions before the first state.
         begin = int(beginnings[np.searchsorted(beginnings, run.start, side="right") - 1])
