@@ -69,7 +69,7 @@ def make_dynamics(
     Parameters
     ----------
     system : str, path-like, System or pinocchio.Model
-        Robot as in `load_robot`: a name of `list_robots`, the path of a URDF file, or a model.
+        Robot as in `load_robot`: a name of `list_robots`, the path of a URDF or an MJCF file, or a model.
     n_trajectories : int, default=None
         Number of trajectories. If None, that of the paper, or 100 for other robots.
     n_steps : int, default=None

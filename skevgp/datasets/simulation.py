@@ -67,7 +67,7 @@ def simulate(
     Parameters
     ----------
     system : str, path-like, System or pinocchio.Model
-        Robot as in `load_robot`: a name of `list_robots`, the path of a URDF file, or a model.
+        Robot as in `load_robot`: a name of `list_robots`, the path of a URDF or an MJCF file, or a model.
     z0 : array-like of shape (2 * n_joints,) or (n_trajectories, 2 * n_joints)
         Initial states: joint positions (rad or m), then velocities (rad/s or m/s).
     U : array-like of shape (n_steps, n_inputs) or (n_trajectories, n_steps, n_inputs), or callable

@@ -17,9 +17,10 @@ import numpy as np
 
 from ..exceptions import RobotModelWarning, warn_user
 from ..utils.optional import require
+from .mjcf import read_mjcf
 from .systems import GRAVITY, SYSTEMS, Layout, System
 from .unphysical import check_bodies
-from .urdf_file import checked_urdf
+from .urdf_file import checked_urdf, parsed
 
 _COLLECTION = "example-robot-data"
 # Sentences of a warning about a file.
@@ -38,7 +39,7 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model
-        Name from `list_robots`, path of a URDF file, or a model. A model is checked too.
+        Name from `list_robots`, path of a URDF or an MJCF file, or a model. A model is checked too.
     joints : sequence of str, default=None
         Names of the joints that move, in the order of the robot, such as those of a log. All other joints are locked at
         position 0, or at the limit nearest to 0. Their links become part of the link before them. If None, all joints
@@ -57,10 +58,11 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     ImportError
         If Pinocchio is not installed. The message gives the pip command.
     ValueError
-        If no robot has this name, or the file does not exist or is not a URDF. If no joint moves, or a joint is neither
-        revolute nor prismatic. If a number of the model is unphysical, such as a negative mass, or the mass matrix is
-        not positive definite. If ``joints`` is empty, has unknown or repeated names or another order than the robot, or
-        if none of ``joints`` has a motor. The message names the joint or the link, and the number.
+        If no robot has this name, or the file does not exist or is neither a URDF nor an MJCF. If no joint moves, or a
+        joint is neither revolute nor prismatic. If a number of the model is unphysical, such as a negative mass, or the
+        mass matrix is not positive definite. If an MJCF closes a loop, or has elements that are not read. If ``joints``
+        is empty, has unknown or repeated names or another order than the robot, or if none of ``joints`` has a motor.
+        The message names the joint or the link, and the number.
     TypeError
         If ``robot`` has another type.
 
@@ -68,8 +70,8 @@ def load_robot(robot: Robot, *, joints: Sequence[str] | None = None) -> Any:
     -----
     RobotModelWarning
         If the moments of inertia of a link violate the triangle inequality, which no body does, by more than the
-        rounding of their digits. If a file has numbers that are not used, such as a negative limit. If a link of a
-        file has a negative mass.
+        rounding of their digits. If a file has numbers that are not used, such as a negative limit, or the springs of
+        an MJCF. If a link of a file has a negative mass.
 
     See Also
     --------
@@ -109,6 +111,10 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
     if isinstance(robot, (str, os.PathLike)):
         path = urdf_path(robot)
         pin = require("pinocchio", "Loading a robot")
+        if _root_of(path) == "mujoco":
+            model, found = read_mjcf(path)
+            plain, warnings = _plain(model, f"The robot {str(robot)!r}")
+            return plain, _of_file(path, found) + warnings
         urdf = checked_urdf(path)
         try:
             model = pin.buildModelFromXML(urdf.text)
@@ -116,17 +122,35 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
             raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
         _lift_efforts(model, urdf.unknown_efforts)
         plain, warnings = _plain(model, f"The robot {str(robot)!r}", urdf.possible_links)
-        told = urdf.warnings[:_MOST_TOLD]
-        if len(urdf.warnings) > _MOST_TOLD:
-            told.append(f"({len(urdf.warnings) - _MOST_TOLD} more are like these.)")
-        return plain, [f"The file {str(path)!r}: {' '.join(told)}"] * bool(told) + warnings
+        return plain, _of_file(path, urdf.warnings) + warnings
     pin = require("pinocchio", "Loading a robot")
     if isinstance(robot, pin.Model):
         return _plain(robot, f"The model {robot.name!r}")
     raise TypeError(
-        f"A robot must be a name (skevgp.datasets.list_robots() gives them), the path of a URDF file, a System or a "
-        f"pinocchio.Model; got {robot!r}."
+        f"A robot must be a name (skevgp.datasets.list_robots() gives them), the path of a URDF or an MJCF file, a "
+        f"System or a pinocchio.Model; got {robot!r}."
     )
+
+
+def _root_of(path: Path) -> str:
+    """The root element of a robot's file: "robot" of a URDF, also of a file that is not XML, "mujoco" of an MJCF."""
+    try:
+        root: str = parsed(path)[1].tag
+    except ValueError:
+        return "robot"  # whose reader says what is wrong
+    if root not in ("robot", "mujoco"):
+        raise ValueError(
+            f"The file {str(path)!r} is neither a URDF nor an MJCF: its root is <{root}>, not <robot> or <mujoco>."
+        )
+    return root
+
+
+def _of_file(path: Path, warnings: list[str]) -> list[str]:
+    """One warning of the first sentences about a file, if there are any."""
+    told = warnings[:_MOST_TOLD]
+    if len(warnings) > _MOST_TOLD:
+        told.append(f"({len(warnings) - _MOST_TOLD} more are like these.)")
+    return [f"The file {str(path)!r}: {' '.join(told)}"] * bool(told)
 
 
 def list_robots() -> list[str]:
@@ -232,7 +256,7 @@ def _axis(joint: Any) -> np.ndarray:
 
 
 def urdf_path(robot: str | os.PathLike[str]) -> Path:
-    """The URDF file of a name or path, or an error, which lists the known names if it may be a name."""
+    """The file of a name or path, or an error, which lists the known names if it may be a name."""
     names = _collection()
     if isinstance(robot, str) and robot in names:
         return names[robot]
@@ -240,7 +264,7 @@ def urdf_path(robot: str | os.PathLike[str]) -> Path:
     if path.is_file():
         return path
     if robot and path.is_dir():
-        raise ValueError(f"{str(path)!r} is a folder; a robot is one URDF file.")
+        raise ValueError(f"{str(path)!r} is a folder; a robot is one URDF or MJCF file.")
     if not isinstance(robot, str):
         raise ValueError(f"There is no file {str(path)!r}; a robot's name must be a string, not a path.")
     if path.suffix == ".urdf" or len(path.parts) > 1:
@@ -252,7 +276,9 @@ def urdf_path(robot: str | os.PathLike[str]) -> Path:
     close = [repr(known[name]) for name in get_close_matches(robot.lower(), known, n=3)]
     hint = f" Did you mean {' or '.join(close)}?" if close else ""
     more = "" if names else f" (pip install {_COLLECTION} brings more)"
-    raise ValueError(f"Unknown robot {robot!r}.{hint} The known ones are {list_robots()}{more}, and any URDF path.")
+    raise ValueError(
+        f"Unknown robot {robot!r}.{hint} The known ones are {list_robots()}{more}, and any URDF or MJCF path."
+    )
 
 
 @lru_cache(maxsize=1)
@@ -337,7 +363,7 @@ def _plain(model: Any, called: str, possible_links: Container[str] = ()) -> tupl
         if joint.nv != 1 or joint.nq > 2 or ((axis := _axis(joint))[:3].any() and axis[3:].any()):
             raise ValueError(
                 f"{called} has the joint {name!r} of the type {joint.shortname()}; joints must be revolute or "
-                "prismatic and the base fixed (load the URDF without a free-flyer)."
+                "prismatic and the base fixed (load the file without a free-flyer)."
             )
         length = np.linalg.norm(axis)
         if not abs(length - 1.0) <= _AXIS_TOLERANCE:

@@ -25,12 +25,12 @@ import numpy as np
 MOMENTS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
 _LIMITED = ("revolute", "prismatic")
 _KINDS = (*_LIMITED, "continuous", "fixed", "floating", "planar")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 # Pinocchio divides by the square of an axis's length.
 _SHORTEST_AXIS = 1e-9
 # ElementTree writes by recursion. Pinocchio goes from joint to joint by recursion, and makes matrices of as many rows
 # and columns as joints move.
-_DEEPEST, _LONGEST_CHAIN, _MOST_JOINTS = 100, 500, 300
+_DEEPEST, _LONGEST_CHAIN, MOST_JOINTS = 100, 500, 300
 # Share of the masses of a body below which their sum is rounding.
 _ROUNDING = 1e-12
 # Elements that simulators and controllers read, whatever is in them.
@@ -43,30 +43,42 @@ def read_elements(path: Path) -> tuple[ET.Element, ET.Element]:
     Raises
     ------
     ValueError
-        If the file is not XML, has a document type declaration, or its root is not <robot>. The message names the file.
+        If `parsed` refuses the file, or its root is not <robot>. The message names the file.
+    """
+    with naming(path):
+        document, robot = parsed(path)
+        if robot.tag != "robot":
+            raise ValueError(f"its root is <{robot.tag}>, not <robot>")
+    return document, robot
+
+
+def parsed(path: Path) -> tuple[ET.Element, ET.Element]:
+    """Read an XML file: its root, and an element around it.
+
+    Raises
+    ------
+    ValueError
+        If the file is not XML, has a document type declaration, or elements are too deep in each other.
     """
     # Expat knows no namespaces here: a prefix stays a part of the name, and need not be declared.
     parser, tree = expat.ParserCreate(), ET.TreeBuilder(insert_comments=True, insert_pis=True)
     parser.StartElementHandler, parser.EndElementHandler = tree.start, tree.end
     parser.CharacterDataHandler, parser.CommentHandler = tree.data, tree.comment
     parser.ProcessingInstructionHandler, parser.StartDoctypeDeclHandler = tree.pi, _refuse_declaration
-    with _naming(path):
-        tree.start("document", {})
-        try:
-            parser.Parse(path.read_bytes(), True)
-        except (expat.ExpatError, LookupError) as error:
-            raise ValueError(str(error)) from error
-        tree.end("document")
-        document = tree.close()
-        robot = next(element for element in document if isinstance(element.tag, str))
-        if robot.tag != "robot":
-            raise ValueError(f"its root is <{robot.tag}>, not <robot>")
-        level = [robot]
-        for _ in range(_DEEPEST):
-            level = [child for element in level for child in element]
-        if level:
-            raise ValueError(f"it has elements more than {_DEEPEST} deep in each other")
-    return document, robot
+    tree.start("document", {})
+    try:
+        parser.Parse(path.read_bytes(), True)
+    except (expat.ExpatError, LookupError) as error:
+        raise ValueError(str(error)) from error
+    tree.end("document")
+    document = tree.close()
+    root = next(element for element in document if isinstance(element.tag, str))
+    level = [root]
+    for _ in range(_DEEPEST):
+        level = [child for element in level for child in element]
+    if level:
+        raise ValueError(f"it has elements more than {_DEEPEST} deep in each other")
+    return document, root
 
 
 def _refuse_declaration(*_: object) -> None:
@@ -74,11 +86,12 @@ def _refuse_declaration(*_: object) -> None:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming(path: Path, what: str = "a URDF") -> Iterator[None]:
+    """Name the file in an error."""
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"The file {str(path)!r} is not a URDF that can be read: {error}.") from error
+        raise ValueError(f"The file {str(path)!r} is not {what} that can be read: {error}.") from error
 
 
 def child_of(joint: ET.Element, end: str = "child") -> str:
@@ -120,7 +133,7 @@ def checked_urdf(path: Path) -> CheckedUrdf:
         negative, negative masses are too large, or a joint moves along no axis. The message names the file.
     """
     _, robot = read_elements(path)
-    with _naming(path):
+    with naming(path):
         _check_expanded(robot)
         copy = _copied(robot)
         links = [link.attrib["name"] for link in copy.findall("link")]
@@ -182,7 +195,7 @@ def _copied(element: ET.Element, inside: str = "") -> ET.Element:
 
 def _checked(text: str, n_numbers: int, where: str) -> str:
     parts = text.split()
-    if len(parts) != n_numbers or not all(_NUMBER.fullmatch(each) and math.isfinite(float(each)) for each in parts):
+    if len(parts) != n_numbers or not all(NUMBER.fullmatch(each) and math.isfinite(float(each)) for each in parts):
         expected = "a finite number" if n_numbers == 1 else f"{n_numbers} finite numbers"
         raise ValueError(f"{where} must be {expected}; it is {text!r:.80}")
     return " ".join(parts)
@@ -209,8 +222,8 @@ def _check_tree(robot: ET.Element) -> None:
             ((twice, _),) = Counter(names).most_common(1)
             raise ValueError(f"it has two {what}s of the name {twice!r:.80}")
     moving = sum(joint.get("type") != "fixed" for joint in joints)
-    if moving > _MOST_JOINTS:
-        raise ValueError(f"it has {moving} joints that move, more than {_MOST_JOINTS}")
+    if moving > MOST_JOINTS:
+        raise ValueError(f"it has {moving} joints that move, more than {MOST_JOINTS}")
     known, below, children = set(links), dict[str, list[str]](), set[str]()
     for joint in joints:
         kind, called = joint.get("type"), f"the joint {joint.get('name')!r:.80}"

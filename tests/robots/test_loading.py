@@ -244,7 +244,7 @@ def test_motor_works_between_both_limits(lower, upper, driven, limits):
         ("nothing.xml", r"There is no file '.*the names that are known"),
         ("some/where", r"^There is no file '[^']*'\.$"),
         ("~nobody-of-this-name/a.urdf", r"^There is no file '[^']*'\.$"),
-        (Path("folder"), r"is a folder; a robot is one URDF file"),
+        (Path("folder"), r"is a folder; a robot is one URDF or MJCF file"),
         ("", "Unknown robot ''"),
         (Path("panda"), r"no file 'panda'; a robot's name must be a string, not a path"),
         (pinocchio.Model(), "has no joint that moves"),
@@ -275,7 +275,7 @@ def test_joints_of_several_velocities_raise(joint):
 
 @pytest.mark.parametrize("robot", [3, None, ["ur5"], object()])
 def test_invalid_robot_type_raises(robot):
-    with pytest.raises(TypeError, match=r"must be a name .*list_robots.*URDF file"):
+    with pytest.raises(TypeError, match=r"must be a name .*list_robots.*URDF or an MJCF file"):
         load_robot(robot)
 
 
