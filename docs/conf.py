@@ -59,6 +59,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"^(?!plot_)",  # helpers beside them
     "within_subsection_order": "stories.Order",
+    "image_scrapers": ("thumbnails.scrape",),
     "reset_argv": "stories.arguments",
     "reset_modules": ("matplotlib", "stories.as_a_script"),
     "abort_on_example_error": True,

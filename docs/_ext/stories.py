@@ -1,4 +1,4 @@
-"""How the gallery runs the examples, and in which groups and order it shows them."""
+"""How the gallery runs the examples, and in which groups, with which pictures and in which order it shows them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import builtins
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import thumbnails
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -16,7 +18,7 @@ GROUPS = {
     "Tables of numbers": ["sparse_gp", "tabular", "many_rows"],
     "Dynamics of robots": ["learn_dynamics", "any_robot", "nominal_dynamics", "link_gravity", "calibrate_simulator"],
     "Prediction and control": ["rollout", "online", "swing_up", "crocoddyl"],
-    "Arms and their torques": ["real_arm", "payload", "tracking"],
+    "Real arms": ["real_arm", "payload", "tracking"],
 }
 OTHERS = "More examples"  # of no group
 ORDER = [story for stories in GROUPS.values() for story in stories]
@@ -69,6 +71,7 @@ def group_gallery(app: Sphinx) -> None:
     """Group the index of the gallery, after sphinx-gallery has written it."""
     index = Path(app.srcdir, "auto_examples", "index.rst")
     index.write_text(grouped(index.read_text(encoding="utf-8")), encoding="utf-8")
+    thumbnails.put(index.with_name("images") / "thumb")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -15,6 +15,7 @@ sys.path.insert(0, str(DOCS / "_ext"))
 import blocks  # noqa: E402
 import comparison  # noqa: E402
 import stories  # noqa: E402
+import thumbnails  # noqa: E402
 
 NOT_WRITTEN = {"_build", "generated", "tests"}
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not NOT_WRITTEN & set(page.relative_to(DOCS).parts)]
@@ -78,6 +79,22 @@ def test_code_fits_its_column():
 def test_each_example_is_in_a_group_of_the_gallery():
     examples = sorted((DOCS.parent / "examples").glob("plot_*.py"))
     assert sorted(stories.ORDER) == [path.stem.removeprefix("plot_") for path in examples]
+    assert list(thumbnails.PANELS) == stories.ORDER
+
+
+def test_thumbnail_is_one_panel_without_small_words(tmp_path):
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3))
+    left.plot([0, 1], [0, 1], label="a line")
+    right.plot([0, 1], [1, 0], label="another")
+    left.set_title("Left")
+    right.legend()
+    thumbnails.save(figure, thumbnails.Panel(1, "x", "y"), tmp_path / "made.png")
+    assert right.get_legend() is not None
+    assert left.get_visible()
+    pixels = plt.imread(tmp_path / "made.png")
+    assert pixels.shape[:2] == (thumbnails.HEIGHT * thumbnails.DPI, thumbnails.WIDTH * thumbnails.DPI)
+    assert (pixels[..., :3].min(axis=2) < 0.5).mean() < 0.1  # lines on white
+    plt.close(figure)
 
 
 def test_each_source_file_that_a_page_names_is_there():
