@@ -619,7 +619,9 @@ def contact_tables(rows: pd.DataFrame) -> harness.Tables:
     ).reset_index(names=["machine", "per hour"])
     # The monitors of a machine differ by the move that they are not fitted to. The first one stands for all.
     first = rows.groupby(["robot", "rate"], sort=False)["detectable"].first()
-    return {"contact": table.assign(**{"detectable, N m": first.to_numpy()})}
+    joints = [[float(value) for value in str(values).split()] for values in first]
+    named = {"detectable, N m: least": [min(each) for each in joints], "greatest": [max(each) for each in joints]}
+    return {"contact": table.assign(**named)}
 
 
 # --- logs that do not fit ------------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ html_copy_source = False
 html_show_sourcelink = False
 html_theme_options = {
     "logo": {"text": "skevgp", "image_light": "_static/favicon.svg", "image_dark": "_static/favicon.svg"},
-    "header_links_before_dropdown": 6,
+    "header_links_before_dropdown": 7,
     "navigation_with_keys": False,
     "show_prev_next": True,
     "secondary_sidebar_items": ["page-toc"],
@@ -94,7 +94,17 @@ html_theme_options = {
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
 # Pages on their own have nothing to list beside them; results are wide, and stories are listed by their pictures.
-ALONE = ["index", "start", "which_model", "comparison", "reproduction", "tests", "changelog", "generated/source/*"]
+ALONE = [
+    "index",
+    "start",
+    "real_arms",
+    "which_model",
+    "comparison",
+    "reproduction",
+    "tests",
+    "changelog",
+    "generated/source/*",
+]
 ALONE += ["from_0_1_to_0_2"]
 ALONE += ["benchmarks", "generated/results/*", "auto_examples/*"]
 html_sidebars = {page: [] for page in [*ALONE, "questions"]}

@@ -26,5 +26,7 @@ def copy(app: Sphinx, failed: Exception | None) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Set where pages look for MathJax."""
     app.config.mathjax_path = "mathjax/tex-chtml.js"
+    # The horizontal stroke of \top is too thin for screens, which show a bar.
+    app.config.mathjax3_config = {"tex": {"macros": {"top": r"{\mathsf{T}}"}}}
     app.connect("build-finished", copy)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -4,6 +4,7 @@ They are written to ``generated`` before Sphinx looks for pages, so that there i
 The role ``src`` links to a source file's page: ``{src}`skevgp/metrics.py```.
 """
 
+import configparser
 import inspect
 import re
 import shutil
@@ -102,13 +103,21 @@ def write_results() -> None:
         if title in titles:  # of another run of the same benchmark
             title = f"{title} ({report.stem})"
         titles.add(title)
-        added = []
         picture = report.with_suffix(".png")
         if picture.exists() and picture.name not in text:
-            added.append(f"![{title}](/../benchmarks/results/{picture.name})")
+            rest += f"\n![{title}](/../benchmarks/results/{picture.name})\n"
         numbers = [file for file in sorted(RESULTS.glob(f"{report.stem}.csv*")) if file.is_file()]
-        added += [f"{{download}}`{file.name} </../benchmarks/results/{file.name}>`: a row per run." for file in numbers]
-        write(GENERATED / "results" / report.name, "\n\n".join([f"# {title}\n{rest.rstrip()}", *added]) + "\n")
+        added = [f"{{download}}`{file.name} </../benchmarks/results/{file.name}>`: a row per run." for file in numbers]
+        write(GENERATED / "results" / report.name, "\n\n".join([f"# {title}", *answer_first(rest), *added]) + "\n")
+
+
+def answer_first(text: str) -> list[str]:
+    """Split a report into paragraphs: its answer and its first picture come first, a note in italics after them."""
+    parts = [part for part in re.split(r"\n{2,}", text.strip("\n")) if part]
+    notes = parts[:1] if parts[0].startswith("*") else []
+    answer, *others = parts[len(notes) :]
+    pictures = [part for part in others if re.fullmatch(r"!\[[^\]]*\]\([^)]*\)", part)][:1]
+    return [answer, *pictures, *notes, *(part for part in others if part not in pictures)]
 
 
 def public_modules() -> list[tuple[str, ModuleType]]:
@@ -123,9 +132,16 @@ def tables(module: str, names: Iterable[str]) -> str:
     return f".. currentmodule:: {module}\n\n.. autosummary::\n   :toctree: api\n   :nosignatures:\n\n{entries}\n"
 
 
+def of_real_arms() -> tuple[str, ...]:
+    """Name the modules of the part for real arms: those that the contract on imports protects."""
+    contracts = configparser.ConfigParser()
+    contracts.read(ROOT / "setup.cfg", encoding="utf-8")
+    return tuple(f"{name}." for name in contracts["importlinter:contract:real_arms"]["protected_modules"].split())
+
+
 def write_api() -> None:
     """Write the overview of all public names; autosummary writes a page for each."""
-    title, listed = "API reference", set()
+    title, listed, arms = "API reference", set(), {}
     parts = [f"{title}\n{'=' * len(title)}\n\nAll public names. The examples in these pages are tests.\n"]
     for name, module in public_modules():
         members = [each for each in module.__all__ if not each.startswith("_")]
@@ -133,8 +149,13 @@ def write_api() -> None:
         # What two modules have is listed with the first.
         callables = [each for each in members if callable(thing := getattr(module, each)) and thing not in listed]
         listed |= {getattr(module, each) for each in callables}
+        homes = of_real_arms()
+        arms[name] = [each for each in callables if f"{getattr(module, each).__module__}.".startswith(homes)]
         summary = inspect.getdoc(module).splitlines()[0].rstrip(".")
-        parts.append(f"{name}\n{'-' * len(name)}\n\n{summary}.\n\n{tables(name, callables)}")
+        others = [each for each in callables if each not in arms[name]]
+        parts.append(f"{name}\n{'-' * len(name)}\n\n{summary}.\n\n{tables(name, others)}")
+    parts.append("Real arms\n---------\n\n:doc:`Logs, identification, contact and URDF files </real_arms>`.\n")
+    parts += [tables(name, names) for name, names in arms.items() if names]
     parts.append("What methods return\n-------------------\n")
     parts += [tables(module, names) for module, names in RETURNED.items()]
     write(GENERATED / "api.rst", "\n".join(parts))
