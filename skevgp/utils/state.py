@@ -13,6 +13,7 @@ from sklearn.base import BaseEstimator
 
 from .._version import __version__
 from ..exceptions import InconsistentVersionWarning, warn_user
+from .doc_links import DocumentedEstimator
 from .frames import FrameColumns
 
 _KEY = "_skevgp_version"
@@ -27,7 +28,7 @@ def stored_as(kind: type, of: Callable[[Any], Any], back: Callable[[Any], Any]) 
     _STORED[kind] = of, back
 
 
-class StatefulEstimator(BaseEstimator):
+class StatefulEstimator(DocumentedEstimator, BaseEstimator):
     """An estimator whose state holds the version, with a warning if it is loaded by another version."""
 
     def __getstate__(self) -> dict[str, Any]:
