@@ -154,7 +154,8 @@ def write_api() -> None:
         summary = inspect.getdoc(module).splitlines()[0].rstrip(".")
         others = [each for each in callables if each not in arms[name]]
         parts.append(f"{name}\n{'-' * len(name)}\n\n{summary}.\n\n{tables(name, others)}")
-    parts.append("Real arms\n---------\n\n:doc:`Logs, identification, contact and URDF files </real_arms>`.\n")
+    parts.append(".. _api-real-arms:\n\nReal arms\n---------\n")
+    parts.append(":doc:`Logs, identification, contact and URDF files </real_arms>`.\n")
     parts += [tables(name, names) for name, names in arms.items() if names]
     parts.append("What methods return\n-------------------\n")
     parts += [tables(module, names) for module, names in RETURNED.items()]

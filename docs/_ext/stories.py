@@ -61,9 +61,11 @@ def grouped(text: str) -> str:
     for part in re.split(r'(?=\.\. raw:: html\n\n    <div class="sphx-glr-thumbcontainer")', inside):
         if name := re.search(r":doc:`/auto_examples/plot_(\w+)`", part):
             groups[group_of.get(name[1], OTHERS)].append(part)
-    sections = [
-        f"{group}\n{'-' * len(group)}\n\n{opened}{''.join(parts)}{closed}" for group, parts in groups.items() if parts
-    ]
+    sections = []
+    for group, parts in groups.items():
+        if parts:
+            label = f".. _gallery-{group.lower().replace(' ', '-')}:"
+            sections.append(f"{label}\n\n{group}\n{'-' * len(group)}\n\n{opened}{''.join(parts)}{closed}")
     return before + "\n".join(sections) + after
 
 
