@@ -156,7 +156,7 @@ def write_api() -> None:
         parts.append(f"{name}\n{'-' * len(name)}\n\n{summary}.\n\n{tables(name, others)}")
     parts.append(".. _api-real-arms:\n\nReal arms\n---------\n")
     parts.append(":doc:`Logs, identification, contact and URDF files </real_arms>`.\n")
-    parts += [tables(name, names) for name, names in arms.items() if names]
+    parts += [f"Of ``{name}``:\n\n{tables(name, names)}" for name, names in arms.items() if names]
     parts.append("What methods return\n-------------------\n")
     parts += [tables(module, names) for module, names in RETURNED.items()]
     write(GENERATED / "api.rst", "\n".join(parts))
