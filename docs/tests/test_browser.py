@@ -16,6 +16,7 @@ TYPES = {
     "guide/index.html": ("User guide", True, False),
     "guide/model.html": ("The model and its bound", True, False),
     "howto/logs.html": ("Read a log", False, True),
+    "real_arms.html": ("Real arms", False, False),
     "which_model.html": ("Which model", False, False),
     "comparison.html": ("How skevgp compares", False, False),
     "questions.html": ("Questions", False, False),

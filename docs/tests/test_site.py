@@ -1,11 +1,16 @@
 """What can be said of the built pages without a browser: links, headings, pictures."""
 
+import re
 from functools import cache
 from html.parser import HTMLParser
 from itertools import pairwise
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from sklearn.base import BaseEstimator
+
+import skevgp
+from skevgp.utils.doc_links import page_of
 
 from .conftest import SITE
 
@@ -112,6 +117,22 @@ def test_a_story_shows_its_own_pictures(site, page):
     """No others' are left open when its code runs; one that it saves itself comes beside the one that it shows."""
     shown = {source for source, _ in parsed(page.relative_to(SITE).as_posix()).pictures if "sphx_glr" in source}
     assert 1 <= len(shown) <= 2
+
+
+@pytest.mark.parametrize("page", sorted((SITE / "generated" / "results").glob("*.html")), ids=lambda page: page.stem)
+def test_results_begin_with_a_sentence_and_their_picture(site, page):
+    article = page.read_text(encoding="utf-8").partition("</h1>")[2].partition("</article>")[0]
+    first = re.findall(r"<(p|img|table|h2)\b", article)
+    assert first[0] == "p"
+    if "img" in first:
+        assert "table" not in first[: first.index("img")]
+
+
+def test_displays_of_estimators_link_to_pages_that_are_there(site):
+    kinds = [getattr(module, name) for module in (skevgp, skevgp.features) for name in module.__all__]
+    pages = [page_of(kind) for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseEstimator)]
+    assert len(pages) > 12
+    assert not [page for page in pages if not (site / page).is_file()]
 
 
 def test_titles_differ(site):
