@@ -100,7 +100,7 @@ def load_log(
     """Load a robot's own logs as data for inverse dynamics: [q, q̇, q̈] and the torques.
 
     The function reads tables and rosbag2 recordings, resamples and filters the signals, computes missing derivatives,
-    and cuts gaps and rest. :doc:`Read a log </howto/logs>` describes each step.
+    and cuts gaps and rest. :doc:`How a log is processed </howto/logs_reference>` describes each step.
 
     Parameters
     ----------
