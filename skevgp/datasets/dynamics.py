@@ -64,7 +64,7 @@ def make_dynamics(
 
     Each trajectory starts at a random state. Random inputs drive robots with a joint that has no motor, and the
     pendulum. All other robots follow smooth references by computed-torque control.
-    :doc:`What is read from a URDF </howto/urdf_reference>`
+    :doc:`/howto/urdf_reference`
     describes how each robot is sampled.
 
     Parameters

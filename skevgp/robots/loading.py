@@ -140,7 +140,7 @@ def list_robots() -> list[str]:
     Notes
     -----
     The trunk of legged robots and drones is fixed to the world.
-    :doc:`What is read from a URDF </howto/urdf_reference>` names the robots that
+    :doc:`/howto/urdf_reference` names the robots that
     cannot be simulated, because some of their joints move no mass.
 
     Examples
