@@ -8,8 +8,8 @@
     python benchmarks/machines.py inverse --quick                  # simulated machines only, few rows: a minute
 
 The data folder has the folders real (acrobot, double_pendulum, simple_pendulum, kr300, panda), ur10e and ur10, or some
-of them. Machines without logs are left out, and simulated machines need none. No row of the logs is written anywhere. A
-page of the documentation says how to add a machine.
+of them. Machines without logs are left out, and simulated machines need none. No row of the logs is written anywhere.
+benchmarks/README.md says where logs come from, and how to add a machine.
 
 *inverse* compares models of joint torques. Each split has whole moves for training and other whole moves for tests.
 Least squares has the rigid-body features with friction, fitted by `numpy.linalg.lstsq`. "updated" is `InverseDynamics`

@@ -77,8 +77,8 @@ for name, error in errors.items():
 # Calibrate a wrong simulator
 # ---------------------------
 # Plumlee (2017) simulates 4 x + x sin(5 x) by a line θ x. No θ is right. With ``discrepancy="free"``, the Gaussian
-# process can imitate the line, so θ is very uncertain. With ``"orthogonal"``, θ is the best fit in least squares, which
-# the data determine well. Predictions are the same.
+# process can follow the line too, so θ is very uncertain. With ``"orthogonal"``, θ is the best fit in least squares,
+# which the data determine well. Predictions are the same.
 
 
 def line(X, slope):

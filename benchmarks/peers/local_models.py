@@ -72,6 +72,16 @@ def exact(n_rows: int, job: SimpleNamespace) -> Fitted:
     return Fitted(partial(model.predict, return_std=True), len(rows))
 
 
+def gpr(job: SimpleNamespace) -> Fitted:
+    """Fit scikit-learn's exact Gaussian process, with a length scale for each column and learned noise."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    kernel = ConstantKernel() * RBF(np.ones(job.X.shape[1])) + WhiteKernel()
+    model = GaussianProcessRegressor(kernel, normalize_y=True).fit(job.X, job.y)
+    return Fitted(partial(model.predict, return_std=True), len(job.X))
+
+
 def boosting(job: SimpleNamespace) -> Fitted:
     """Fit boosting to all rows. Std and interval come from errors on a fifth of the rows, of a fit to the others."""
     from sklearn.ensemble import HistGradientBoostingRegressor
@@ -190,6 +200,7 @@ MODELS = {
     "neighbors-80": Model(partial(evgp, 80), ("skevgp.estimators.evgp",)),
     "exact-2000": Model(partial(exact, 2000), ("skevgp.estimators.egp",)),
     "exact-5000": Model(partial(exact, 5000), ("skevgp.estimators.egp",)),
+    "GPR": Model(gpr, ("sklearn.gaussian_process",)),
     "boosting": Model(boosting, ("sklearn.ensemble",)),
     "GPBoost-VIF": Model(partial(gpboost, "full_scale_vecchia"), ("gpboost",)),
     "GPBoost-Vecchia": Model(partial(gpboost, "vecchia"), ("gpboost",)),

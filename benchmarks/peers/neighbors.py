@@ -6,6 +6,7 @@ what does it cost?
     python benchmarks/peers/neighbors.py --data ../data  # with the folder uci: kin40k, elevators and airfoil
     python benchmarks/peers/neighbors.py --sets waves-20000 --models sparse neighbors
     python benchmarks/peers/neighbors.py --data ../data --peer-python .peers/bin/python --limit 900
+    python benchmarks/peers/neighbors.py --curves  # time and error over rows of waves, with a picture
     python benchmarks/peers/neighbors.py --quick  # small made sets: a minute
 
 Models are fitted one after the other, each in a separate process on two cores. The CSV has one row per fit. A fit that
@@ -19,6 +20,7 @@ Columns and targets are divided by the training rows' standard deviation.
 
 - "sparse" and "neighbors" are EVGPRegressor with 0 and 60 neighbours. "exact-2000" is EGPRegressor on at most 2,000
   random training rows. "exact-5000" and "neighbors-80" are measured only if they are named.
+- "GPR" is scikit-learn's GaussianProcessRegressor, fitted to at most 4,000 rows. It is measured with --curves.
 - "boosting" is HistGradientBoostingRegressor with early stopping and at most 2,000 trees. Its std and its interval
   (split conformal) come from a first fit to four fifths of the rows. Both fits are timed.
 - GPBoost, MuyGPyS and GPyTorch run with --peer-python, which is an interpreter that has them:
@@ -127,7 +129,7 @@ class DataSet(NamedTuple):
 
     load: Callable[[int, Any], Data]
     n_seeds: int = 2
-    models: tuple[str, ...] = tuple(name for name in MODELS if name not in ("exact-5000", "neighbors-80"))
+    models: tuple[str, ...] = tuple(name for name in MODELS if name not in ("exact-5000", "neighbors-80", "GPR"))
 
 
 TABLES = {
@@ -146,6 +148,19 @@ QUICK = {
     "friedman1-200": DataSet(partial(made, friedman, 200, 50), 1),
     "waves-300": DataSet(partial(made, waves, 300, 50), 1),
 }
+# Models and sizes of the picture. The exact model is fitted to at most so many rows.
+NAMES = {
+    "GPR": "GaussianProcessRegressor",
+    "boosting": "HistGradientBoostingRegressor",
+    "sparse": "EVGPRegressor",
+    "neighbors": "EVGPRegressor, 60 neighbours",
+}
+MOST_EXACT = 4000
+CURVES = {
+    f"waves-{n}": DataSet(partial(made, waves, n, 5000), 1, tuple(NAMES)[n > MOST_EXACT :])
+    for n in (500, 1000, 2000, 4000, 20_000, 100_000)
+}
+QUICK_CURVES = {f"waves-{n}": DataSet(partial(made, waves, n, 50), 1, tuple(NAMES)) for n in (100, 200)}
 
 
 # --- running -------------------------------------------------------------------------------------------------------
@@ -244,9 +259,36 @@ def tables_of(rows: pd.DataFrame) -> harness.Tables:
     return tables
 
 
+def tables_of_curves(rows: pd.DataFrame) -> harness.Tables:
+    """Return a table with a row for each number of rows and model."""
+    means = rows.groupby(["n_train", "model"]).mean(numeric_only=True)
+    pairs = [(n, model) for n, own in rows.groupby("n_train") for model in harness.ordered([*NAMES], own["model"])]
+    columns = {"rmse": "RMSE", "nlpd": "NLPD", "coverage": "coverage", "cpu_seconds": "CPU s"}
+    named = means.loc[pairs, list(columns)].rename(columns=columns).reset_index()
+    return {"curves": named.rename(columns={"n_train": "rows"})}
+
+
+def draw_curves(rows: pd.DataFrame, path: Path) -> None:
+    """Draw the time of a fit and the error of new rows over the number of training rows."""
+    figure, axes = harness.pyplot().subplots(1, 2, figsize=(harness.WIDTH, 3.2), layout="constrained")
+    panels = {"cpu_seconds": "processor time of the fit (s)", "rmse": "error of new rows (std of y)"}
+    for ax, (column, label) in zip(axes, panels.items(), strict=True):
+        for (name, shown), color in zip(NAMES.items(), harness.PALETTE, strict=False):
+            own = rows[rows["model"] == name].groupby("n_train")[column].mean()
+            ax.plot(own.index, own, "o-", color=color, label=shown)
+        ax.set(xlabel="training rows", ylabel=label)
+        harness.logarithmic(ax, "x")
+        harness.logarithmic(ax)
+    harness.legend(figure, ncols=2)
+    harness.save_picture(figure, path)
+
+
 def main() -> None:
     parser = harness.argument_parser(__doc__, quick="small made sets, a minute", in_processes=False)
-    parser.add_argument("--sets", nargs="+", choices=[*SETS, *QUICK], metavar="SET", help=f"of {', '.join(SETS)}")
+    parser.add_argument("--curves", action="store_true", help="time and error over the number of rows of waves")
+    parser.add_argument(
+        "--sets", nargs="+", choices=[*SETS, *QUICK, *CURVES], metavar="SET", help=f"of {', '.join(SETS)}"
+    )
     parser.add_argument("--models", nargs="+", choices=MODELS, metavar="MODEL", help=f"of {', '.join(MODELS)}")
     said = "number of seeds of each set; default: 1 for kin40k and million, 5 for airfoil, otherwise 2"
     parser.add_argument("--seeds", dest="n_seeds", type=int, help=said)
@@ -255,10 +297,13 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=1800.0, help="seconds per fit; default: %(default)s")
     options = harness.parse(parser)
     known = QUICK if options.quick else SETS
+    if options.curves:
+        known = QUICK_CURVES if options.quick else CURVES
     if options.data is None:
         known = {name: found for name, found in known.items() if name not in TABLES}
-    output = harness.output_path(options, "neighbors")
-    pythons = interpreters(options.models or SETS["airfoil"].models, options.peer_python)
+    output = harness.output_path(options, "neighbors_curves" if options.curves else "neighbors")
+    models = dict.fromkeys(name for found in known.values() for name in found.models)
+    pythons = interpreters(options.models or models, options.peer_python)
     cells = [
         Cell(name, model, seed)
         for name in options.sets or known
@@ -269,7 +314,12 @@ def main() -> None:
     ]
     fit = partial(run, known=known, pythons=pythons, folder=options.data, limit=options.limit)
     n_failures = harness.run_missing(cells, fit, output)
-    harness.write_page("Nearest rows beside inducing points", tables_of(harness.frame(output)), output, n_failures)
+    rows = harness.frame(output)
+    if options.curves:
+        draw_curves(rows, output.with_suffix(".png"))
+        harness.write_page("Time and error over rows", tables_of_curves(rows), output, n_failures)
+    else:
+        harness.write_page("Nearest rows beside inducing points", tables_of(rows), output, n_failures)
 
 
 if __name__ == "__main__":

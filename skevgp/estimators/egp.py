@@ -67,7 +67,7 @@ class EGPRegressor(GaussianProcess):
     alpha : float, default=None
         Known noise variance. If None, it is learned.
     discrepancy : {"free", "orthogonal"}, default="free"
-        Whether f may imitate the features, as in `EVGPRegressor`.
+        Whether f is independent of the features or orthogonal to them, as in `EVGPRegressor`.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y instead of 0.
     optimizer : "fmin_l_bfgs_b", callable or None, default="fmin_l_bfgs_b"

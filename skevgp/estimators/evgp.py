@@ -88,7 +88,7 @@ class EVGPRegressor(GaussianProcess):
     noise : {"gaussian", "student-t"}, `skevgp.noise.Gaussian` or `skevgp.noise.StudentT`, default="gaussian"
         Noise model. Use ``"student-t"`` if a few rows are outliers, and ``Gaussian(inputs=...)`` for noise in X.
     discrepancy : {"free", "orthogonal"}, default="free"
-        Whether f may imitate the features (``"free"``), or is orthogonal to them. See :doc:`/guide/parameters`.
+        Whether f is independent of the features (``"free"``), or orthogonal to them. See :doc:`/guide/parameters`.
     noise_cv : int, default=5
         Number of folds that calibrate signal and noise variance. If None, there is no calibration. See
         :doc:`/guide/noise`.

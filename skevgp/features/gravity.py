@@ -157,7 +157,7 @@ class LinkGravity(OffsetAngles, GravityMap):
 
     Here :math:`R_i` is the rotation of the link, :math:`g` is the gravity vector, and :math:`u_z` is the axis of the
     joint in its own frame. A prismatic joint has one feature, gravity along its axis. All features are in m/s². The
-    weights learn the mass and the centre of mass of the link. See the user guide, :doc:`/guide/priors`.
+    weights are products of the mass and the centre of mass of the link. See the user guide, :doc:`/guide/priors`.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ class ParametricFeatures(TransformerMixin, StatefulEstimator):
         Function in autograd.numpy: ``function(X, **theta)`` -> features of shape (n_samples,), (n_samples, n_h) or
         (n_samples, n_outputs, n_h). X is an array. Each row of the result must depend on its own row of X only.
     parameters : dict of str to `Normal`, `LogNormal` or `Uniform`
-        Prior of each parameter, in the parameter's own units. Each argument of ``function`` without a default needs
+        Prior of each parameter, in the units of the parameter. Each argument of ``function`` without a default needs
         one.
     units : dict of str to str, default=None
         Units of the parameters for `summary`, such as ``{"length": "m"}``.

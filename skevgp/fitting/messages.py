@@ -91,7 +91,7 @@ def signal_gone(gone: int, n_outputs: int) -> str:
 
 
 def many_outliers(share: float) -> str:
-    """Message that more rows are outliers than the noise model can tell from the others."""
+    """Message that more rows are outliers than the noise model can separate from the others."""
     if share <= _MOST_OUTLIERS:
         return ""
     return (

@@ -163,7 +163,8 @@ def list_robots() -> list[str]:
 
     Notes
     -----
-    The trunk of legged robots and drones is fixed to the world. :doc:`Bring a URDF </howto/urdf>` names the robots that
+    The trunk of legged robots and drones is fixed to the world.
+    :doc:`/howto/urdf_reference` names the robots that
     cannot be simulated, because some of their joints move no mass.
 
     Examples

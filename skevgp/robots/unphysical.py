@@ -19,8 +19,8 @@ _N_CONFIGURATIONS = 300
 _UNLIMITED = np.pi  # rad or m, where a joint has no limits
 _MOST_NAMED = 3
 _MEND = (
-    "Correct <inertia> of the link; or let torques tell, by InverseDynamics(robot, consistent=True).fit(X, y) and its "
-    "write_urdf(path), which writes inertias that bodies can have."
+    "Correct <inertia> of the link; or estimate it from torques, by InverseDynamics(robot, consistent=True).fit(X, y) "
+    "and its write_urdf(path), which writes inertias that bodies can have."
 )
 
 

@@ -62,6 +62,7 @@ PAGES = {
     "calibration": ("calibration", lambda own, rows: own.tables_of(rows)),
     "robustness": ("robustness", lambda own, rows: own.tables_of(rows)),
     "neighbors": ("peers.neighbors", lambda own, rows: own.tables_of(rows)),
+    "neighbors_curves": ("peers.neighbors", lambda own, rows: own.tables_of_curves(rows)),
 }
 
 
@@ -153,6 +154,12 @@ def on_kin40k(model, sets=("kin40k-8000", "kin40k")):
     return [value for own in found for value in (own["rmse"].mean(), own["seconds"].mean())]
 
 
+def on_waves(n, *models):
+    """Errors and processor seconds of fits to n rows."""
+    found = rows("neighbors_curves", n_train=n).set_index("model").loc[list(models), ["rmse", "cpu_seconds"]]
+    return found.to_numpy().ravel()
+
+
 def arm(model, robot="ur10e", split="three"):
     own = rows("real_arms", robot=robot, split=split, model=model)
     within = np.average(own["cr2"].fillna(0.0), weights=own["n_test"])
@@ -186,10 +193,24 @@ SAID = [
     ("README", "| cartpole with friction | 0.121 | {} | {} | {} |", lambda: gains("cartpole_damped")[1:]),
     ("README", "| acrobot | {} | {} | 0.102 | {} |", lambda: [gains("acrobot")[i] for i in (0, 1, 3)]),
     ("README", "lower error in {} of these 8 cases", noise_free_wins),
-    ("README", "`HistGradientBoostingRegressor` | {} | {} | {} | {} |", lambda: on_kin40k("boosting")),
-    ("README", "`EVGPRegressor(n_inducing=200)` | {} | {} | {} | {} |", lambda: on_kin40k("sparse")),
-    ("README", "`n_neighbors=60` | {} | {} | {} | {} |", lambda: on_kin40k("neighbors")),
-    ("README", "GPBoost, the same approximation | {} | {} |", lambda: on_kin40k("GPBoost-VIF", ["kin40k-8000"])),
+    (
+        "README",
+        "an error of {} after {} s, and the model with neighbours {} after {} s",
+        lambda: on_waves(4000, "GPR", "neighbors"),
+    ),
+    (
+        "README",
+        "boosting has {} after {} s, and the model with neighbours {} after {} s",
+        lambda: on_waves(100_000, "boosting", "neighbors"),
+    ),
+    ("docs/guide/neighbors", "`HistGradientBoostingRegressor` | {} | {} | {} | {} |", lambda: on_kin40k("boosting")),
+    ("docs/guide/neighbors", "`EVGPRegressor(n_inducing=200)` | {} | {} | {} | {} |", lambda: on_kin40k("sparse")),
+    ("docs/guide/neighbors", "`n_neighbors=60` | {} | {} | {} | {} |", lambda: on_kin40k("neighbors")),
+    (
+        "docs/guide/neighbors",
+        "GPBoost, the same approximation | {} | {} |",
+        lambda: on_kin40k("GPBoost-VIF", ["kin40k-8000"]),
+    ),
     ("docs/reproduction", "| cartpole | 60 | 0.011 | {} | {} |", lambda: errors("cartpole")["ours"]),
     ("docs/reproduction", "| cartpole_damped | 60 | 0.011 | {} | {} |", lambda: errors("cartpole_damped")["ours"]),
     ("docs/reproduction", "| acrobot | 150 | 0.131 | {} | {} |", lambda: errors("acrobot")["ours"]),

@@ -88,6 +88,7 @@ SMOKE = [
     smoke("peers/against_gpr", "--systems smooth --models GPR EVGP --sizes 60"),
     smoke("peers/against_peers", "--datasets smooth --peers 'scikit-learn GPR' 'scikit-learn BayesianRidge'"),
     smoke("peers/neighbors"),
+    smoke("peers/neighbors", "--curves --models boosting sparse"),
     smoke("speed", "latency"),
     smoke("speed", "casadi"),
     smoke("speed", "evaluation", long=False),

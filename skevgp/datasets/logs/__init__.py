@@ -1,4 +1,4 @@
-"""Read a robot's own logs and prepare their signals for learning."""
+"""Read the logs of a robot and prepare their signals for learning."""
 
 from .load import load_log
 from .transitions import log_transitions

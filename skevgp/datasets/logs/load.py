@@ -1,4 +1,4 @@
-"""A robot's own logs, as data for inverse dynamics."""
+"""The logs of a robot, as data for inverse dynamics."""
 
 from __future__ import annotations
 
@@ -97,10 +97,10 @@ def load_log(
     rest_time: float = 0.5,
     return_X_y: bool = False,
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Load a robot's own logs as data for inverse dynamics: [q, q̇, q̈] and the torques.
+    """Load the logs of a robot as data for inverse dynamics: [q, q̇, q̈] and the torques.
 
     The function reads tables and rosbag2 recordings, resamples and filters the signals, computes missing derivatives,
-    and cuts gaps and rest. :doc:`Read a log </howto/logs>` describes each step.
+    and cuts gaps and rest. :doc:`How a log is processed </howto/logs_reference>` describes each step.
 
     Parameters
     ----------

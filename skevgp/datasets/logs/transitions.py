@@ -25,7 +25,7 @@ def log_transitions(
 def log_transitions(
     log: Bunch, *, stride: int = 1, align: bool = True, return_X_y: bool = False
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Turn logs into state transitions with their own time steps, as data for forward dynamics.
+    """Turn logs into state transitions, each with its time step, as data for forward dynamics.
 
     A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
     the target. Signals are neither resampled nor filtered. Angles are unwrapped as by `load_log`. Transitions across a
