@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from skevgp.robots import load_robot
-from skevgp.robots.loading import urdf_path
+from skevgp.robots.loading import robot_file
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 LEARN = EXAMPLES / "plot_learn_dynamics.py"
@@ -72,7 +72,7 @@ def test_example_takes_folder_of_logs(monkeypatch, tmp_path, script):
     folder.mkdir()
     for seed, name in enumerate(names):
         write_log(folder / f"arm_{name}.csv.gz", robot, 5.0, seed)
-    (folder / "arm.urdf").write_bytes(urdf_path("ur10").read_bytes())
+    (folder / "arm.urdf").write_bytes(robot_file("ur10").read_bytes())
     found = run(EXAMPLES / script, folder, "--output", tmp_path, monkeypatch=monkeypatch)
     assert found["com" if "payload" in script else "truth"] is None
 

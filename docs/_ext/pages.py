@@ -141,7 +141,7 @@ def of_real_arms() -> tuple[str, ...]:
 
 def write_api() -> None:
     """Write the overview of all public names; autosummary writes a page for each."""
-    title, listed, arms = "API reference", set(), {}
+    title, listed, arms, homes = "API reference", set(), {}, of_real_arms()
     parts = [f"{title}\n{'=' * len(title)}\n\nAll public names. The examples in these pages are tests.\n"]
     for name, module in public_modules():
         members = [each for each in module.__all__ if not each.startswith("_")]
@@ -149,7 +149,6 @@ def write_api() -> None:
         # What two modules have is listed with the first.
         callables = [each for each in members if callable(thing := getattr(module, each)) and thing not in listed]
         listed |= {getattr(module, each) for each in callables}
-        homes = of_real_arms()
         arms[name] = [each for each in callables if f"{getattr(module, each).__module__}.".startswith(homes)]
         summary = inspect.getdoc(module).splitlines()[0].rstrip(".")
         others = [each for each in callables if each not in arms[name]]

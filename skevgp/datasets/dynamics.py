@@ -63,9 +63,8 @@ def make_dynamics(
     """Simulate data sets of a robot, such as those of section IV-B of the paper.
 
     Each trajectory starts at a random state. Random inputs drive robots with a joint that has no motor, and the
-    pendulum. All other robots follow smooth references by computed-torque control.
-    :doc:`/howto/urdf_reference`
-    describes how each robot is sampled.
+    pendulum. All other robots follow smooth references by computed-torque control. The page
+    :doc:`/howto/urdf_reference` describes how each robot is sampled.
 
     Parameters
     ----------

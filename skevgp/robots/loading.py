@@ -109,7 +109,7 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
     if system is not None:
         return _plain(_model_of_table(system), f"The system {system.name!r}")
     if isinstance(robot, (str, os.PathLike)):
-        path = urdf_path(robot)
+        path = robot_file(robot)
         pin = require("pinocchio", "Loading a robot")
         if _root_of(path) == "mujoco":
             model, found = read_mjcf(path)
@@ -163,9 +163,8 @@ def list_robots() -> list[str]:
 
     Notes
     -----
-    The trunk of legged robots and drones is fixed to the world.
-    :doc:`/howto/urdf_reference` names the robots that
-    cannot be simulated, because some of their joints move no mass.
+    The trunk of legged robots and drones is fixed to the world. The page :doc:`/howto/urdf_reference` names the robots
+    that cannot be simulated, because some of their joints move no mass.
 
     Examples
     --------
@@ -256,7 +255,7 @@ def _axis(joint: Any) -> np.ndarray:
     return np.asarray(data.S, dtype=float).reshape(-1)
 
 
-def urdf_path(robot: str | os.PathLike[str]) -> Path:
+def robot_file(robot: str | os.PathLike[str]) -> Path:
     """The file of a name or path, or an error, which lists the known names if it may be a name."""
     names = _collection()
     if isinstance(robot, str) and robot in names:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..utils.optional import require
-from .urdf_file import MOST_JOINTS, NUMBER, naming, parsed
+from .urdf_file import MOST_JOINTS, checked_numbers, naming, parsed
 
 _GRAVITY = (0.0, 0.0, -9.81)
 _DENSITY = 1000.0
@@ -303,10 +303,8 @@ class _Reader:
             for fixed in self.root.findall("tendon/fixed")
         }
         places = {joint.name: joint.place for joint in self.joints}
-        total, actuators = (
-            np.zeros_like(own),
-            [each for each in self.root.findall("actuator/*") if each.tag in _ACTUATORS],
-        )
+        actuators = [each for each in self.root.findall("actuator/*") if each.tag in _ACTUATORS]
+        total = np.zeros_like(own)
         for actuator in actuators:
             given = self._given(actuator, "general", "main")
             called = f"the actuator {given.get('name', '')!r:.80}"
@@ -475,11 +473,7 @@ def _numbers(
         if default is None:
             raise ValueError(f"{where} has no {name}")
         return np.array(default)
-    parts = given[name].split()
-    if len(parts) != count or not all(NUMBER.fullmatch(part) and math.isfinite(float(part)) for part in parts):
-        expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise ValueError(f"{name} of {where} must be {expected}; it is {given[name]!r:.80}")
-    return np.array([float(part) for part in parts])
+    return np.array([float(part) for part in checked_numbers(given[name], count, f"{name} of {where}")])
 
 
 def _direction(values: np.ndarray, name: str, where: str) -> np.ndarray:

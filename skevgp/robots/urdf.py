@@ -13,7 +13,7 @@ import numpy as np
 
 from ..utils.files import replacing
 from .inertia import body_parameters, checked_covariance, checked_joints, checked_links
-from .loading import Robot, known_robot, named_system, urdf_path
+from .loading import Robot, known_robot, named_system, robot_file
 from .urdf_file import MOMENTS, child_of, links_of_body, read_elements
 
 
@@ -69,7 +69,7 @@ def write_urdf(
     """
     if not isinstance(source, (str, os.PathLike)) or named_system(source) is not None:
         raise ValueError(f"source must be a URDF file, or the name of a robot that has one; got {source!r}.")
-    path = urdf_path(source)
+    path = robot_file(source)
     document, robot = read_elements(path)  # first: errors of what Pinocchio reads say less
     names = list(known_robot(path).names)[1:]
     if not overwrite and Path(target).exists() and Path(target).samefile(path):

@@ -25,7 +25,7 @@ import numpy as np
 MOMENTS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
 _LIMITED = ("revolute", "prismatic")
 _KINDS = (*_LIMITED, "continuous", "fixed", "floating", "planar")
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 # Pinocchio divides by the square of an axis's length.
 _SHORTEST_AXIS = 1e-9
 # ElementTree writes by recursion. Pinocchio goes from joint to joint by recursion, and makes matrices of as many rows
@@ -186,19 +186,20 @@ def _copied(element: ET.Element, inside: str = "") -> ET.Element:
     copy = ET.Element(element.tag)
     for key, n_numbers in part.attributes.items():
         if (text := element.get(key)) is not None:
-            copy.set(key, _checked(text, n_numbers, f"{key} of {where}") if n_numbers else text)
+            copy.set(key, " ".join(checked_numbers(text, n_numbers, f"{key} of {where}")) if n_numbers else text)
     for tag in part.children:
         for child in element.findall(tag)[: None if tag in ("link", "joint") else 1]:
             copy.append(_copied(child, inside if name is None else f" of {where}"))
     return copy
 
 
-def _checked(text: str, n_numbers: int, where: str) -> str:
+def checked_numbers(text: str, n_numbers: int, where: str) -> list[str]:
+    """Split a text into finite numbers, as they are written. The error names ``where``."""
     parts = text.split()
-    if len(parts) != n_numbers or not all(NUMBER.fullmatch(each) and math.isfinite(float(each)) for each in parts):
+    if len(parts) != n_numbers or not all(_NUMBER.fullmatch(each) and math.isfinite(float(each)) for each in parts):
         expected = "a finite number" if n_numbers == 1 else f"{n_numbers} finite numbers"
         raise ValueError(f"{where} must be {expected}; it is {text!r:.80}")
-    return " ".join(parts)
+    return parts
 
 
 def _check_expanded(robot: ET.Element) -> None:

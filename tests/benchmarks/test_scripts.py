@@ -14,7 +14,7 @@ import pytest
 from matplotlib import rc_context
 
 from skevgp.features import RigidBodyRegressor
-from skevgp.robots.loading import urdf_path
+from skevgp.robots.loading import robot_file
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = ROOT / "benchmarks"
@@ -135,7 +135,7 @@ def test_quick_run_on_logs(run_script, tmp_path):
     """The real arms' script runs on logs of a simulated arm."""
     home = tmp_path / "data" / "ur10e"
     home.mkdir(parents=True)
-    shutil.copy(urdf_path("ur10"), home / "ur10e.urdf")
+    shutil.copy(robot_file("ur10"), home / "ur10e.urdf")
     body = RigidBodyRegressor("ur10", friction=["coulomb"])
     rng = np.random.default_rng(0)
     for name in ("20sec_8harm", "30sec_12harm", "40sec_12harm", "14harm50sec", "14harm50secLoad"):

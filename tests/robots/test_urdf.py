@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from skevgp.robots import inertial_parameters, load_robot, physical_consistency, write_urdf
-from skevgp.robots.loading import urdf_path
+from skevgp.robots.loading import robot_file
 
 # The large files are long.
 ROBOTS = ["panda", "ur10", "kinova", "double_pendulum_continuous", "xarm7"]
@@ -101,7 +101,7 @@ def test_written_urdf_is_read_by_pinocchio(name, tmp_path):
 def test_nothing_else_of_a_file_changes(name, tmp_path):
     model, target = load_robot(name), tmp_path / "new.urdf"
     write_urdf(name, target, other_parameters(model))
-    texts = [path.read_text(encoding="utf-8") for path in (urdf_path(name), target)]
+    texts = [path.read_text(encoding="utf-8") for path in (robot_file(name), target)]
     inertials = r"<inertial\s*>.*?</inertial>|<inertial\s*/>|<!-- The inertia of this link is part of that of .*? -->"
     old, new = (re.sub(inertials, "", text, flags=re.S) for text in texts)
     assert ET.canonicalize(old, strip_text=True, with_comments=True) == ET.canonicalize(
