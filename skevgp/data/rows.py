@@ -425,6 +425,12 @@ class Rows:
         own = variance[:, self.columns].mean(axis=1)
         return replace(self, source=self.source.reweighted(1.0 / own, np.log(own)))
 
+    def counted(self, factors: np.ndarray) -> Rows:
+        """The same rows, each of which counts ``factors`` (n_rows,) times as much."""
+        if not isinstance(self.source, LocalSource):
+            raise TypeError("Rows of Dask arrays count once.")
+        return replace(self, source=self.source.counted(factors))
+
     def user_order(self) -> np.ndarray:
         """Indices of the rows, in the order in which the user gave them."""
         positions = self.source.positions

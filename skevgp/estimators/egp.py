@@ -30,7 +30,8 @@ from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.posterior import ExactPosterior
 from ..noise import Gaussian, as_noise
 from ..solvers import LBFGS
-from ..solvers.base import Limits, Minimum, Solver, Tolerance
+from ..solvers.base import Minimum, Solver, Tolerance
+from ..solvers.coordinates import Limits
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor, monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
@@ -463,6 +464,7 @@ class UserOptimizer(Solver):
         tolerance: Tolerance,
         monitor: Monitor,
         curvature: Any = None,
+        metric: Any = None,
     ) -> Minimum:
         """Run the user's function. Arguments are those of `LBFGS.minimise`. It decides itself when it ends."""
         if len(start) == 0:

@@ -78,7 +78,7 @@ class RowDoubts:
 
 def without(rows: Rows, outlier: np.ndarray) -> Rows:
     """The same rows, of which some (n,) have almost no weight."""
-    return replace(rows, source=_local(rows).counted(np.where(outlier, _NOTHING, 1.0)))
+    return rows.counted(np.where(outlier, _NOTHING, 1.0))
 
 
 def _local(rows: Rows) -> LocalSource:

@@ -14,7 +14,8 @@ import numpy as np
 
 from ..kernels.base import Covariance
 from ..model.parameters import ParameterTable, Values
-from ..solvers.base import Limits, Objective
+from ..solvers.base import Objective
+from ..solvers.coordinates import Limits
 from ..solvers.lbfgs import curvature_along_axes
 from ..utils.linalg import NotPositiveDefiniteError
 

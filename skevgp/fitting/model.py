@@ -105,9 +105,7 @@ class Model:
         (o, p), (g, _, d) = self.sparse.prior.scale.shape, self.table["inducing_points"].start.shape
         width = d + p + o if self.sparse.kernels is None else g * (d + p) + o
         if self.is_exact and self.problem.solver.takes_any_objective and not self.has_few_rows:
-            return replace(self.rules, sample=self.rules.exact_sample).samples(
-                len(self.rows), self.n_learned + p, width
-            )
+            return self.rules.exact_samples(len(self.rows), self.n_learned + p)
         return () if self.interpolates else self.rules.samples(len(self.rows), self.n_inducing + p, width)
 
     @property
@@ -137,6 +135,18 @@ class Model:
         """Weights (o, p) with an infinite prior scale."""
         return self.problem.vague[self.rows.columns]
 
+    def _count(self, n_rows: int) -> float:
+        """How often each row of a sample counts: for the rows left out, but a small sample less."""
+        # What inducing points say costs the same in a sample as in all rows. If rows count once, it weighs more, and
+        # the optimum is elsewhere. If those of a small sample count for all rows, the kernel overfits them.
+        return min(len(self.rows), n_rows**2 / self.samples[0]) / n_rows
+
+    @property
+    def _sampled_all(self) -> bool:
+        """Whether the optimum of the last sample is almost that of all rows."""
+        samples = () if self.is_exact else self.samples
+        return len(samples) > 0 and self._count(samples[-1]) * samples[-1] >= len(self.rows)
+
     def objective(self, table: ParameterTable, n_rows: int | None = None) -> Objective:
         """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all.
 
@@ -149,7 +159,7 @@ class Model:
                 return LikelihoodObjective(
                     ExactModel.of(self.sparse, self.vague, sample.some(np.arange(n_rows))), table
                 )
-            blocks = self.sparse.blocks(sample, self.n_inducing)
+            blocks = self.sparse.blocks(sample.counted(np.full(n_rows, self._count(n_rows))), self.n_inducing)
             # It only gives a start. The bound of Titsias (2009) spreads points better: what they leave out costs more.
             loose = replace(self.sparse, variant=replace(self.sparse.variant, tight=False))
             return BoundObjective(loose, table, blocks)
@@ -371,7 +381,10 @@ class Model:
         if self.tol is not None and start.n_rows is None:
             tolerance = Tolerance(self.tol / n_rows)
         else:
-            tolerance = Tolerance(LEAST_TOL / n_rows, ENOUGH, -self.bound_alone / n_rows)
+            share = ENOUGH
+            if start.n_rows is None and not start.cold and self._sampled_all:
+                share *= self.rules.last_share
+            tolerance = Tolerance(LEAST_TOL / n_rows, share, -self.bound_alone / n_rows)
         curvature = None
         if not start.cold:
             # The curvature on the smallest sample, or on all rows.
@@ -384,6 +397,7 @@ class Model:
             tolerance,
             self.monitor.seen_as(spent, n_rows, about=about),
             curvature,
+            start.metric,
         )
         n_iter, name = spent + minimum.n_iter, type(solver).__name__
         return Fit(
@@ -393,6 +407,7 @@ class Model:
             minimum.converged,
             ended_early(name, minimum, n_iter, self.max_iter, self.tol, self.has_inducing_points),
             n_rows=start.n_rows,
+            metric=minimum.metric,
         )
 
     def _by_mini_batches(self, table: ParameterTable, start: Start) -> Fit:

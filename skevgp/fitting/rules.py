@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ..solvers.base import Solver
 from ..utils.linalg import JITTER, Jitter
 
@@ -63,9 +65,14 @@ class Rules:
     # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
     # `LARGEST_SAMPLE`, are left out.
     growth: int = 4
+    # Factor on the tolerance of the last stage, if that of the last sample had almost the same optimum.
+    last_share: float = 3.0
     # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
     # first ones. A small sample may not show that a column matters.
-    longest: float = 3.0
+    longest: float = 10.0
+    # A fit that ends with noise below this share of the residuals' variance is tried with ten times the share: a small
+    # sample may not show noise, and the gradient in the logarithm of a low noise is almost 0.
+    low_noise: float = 1e-4
     # With fewer rows than this for each free number of kernel, signal and noise, these have a prior, whose weight falls
     # from 1 to 0 at so many rows, and predictions are averaged over draws of them (see `few_rows`). 0: never.
     few_rows: float = 12.0
@@ -82,6 +89,14 @@ class Rules:
             size *= self.growth
         return tuple(sizes)
 
+    def exact_samples(self, n_rows: int, n_learned: int) -> tuple[int, ...]:
+        """The same for the exact model. Each is about twice as large as the one before it."""
+        if self.exact_sample is None:
+            return ()
+        first = max(self.exact_sample[0], self.exact_sample[1] * n_learned)
+        n_stages = max(0, round(np.log2(n_rows / first)))
+        return tuple(np.geomspace(first, n_rows, n_stages + 1)[:-1].astype(int).tolist())
+
 
 # Rules for a solver that sees all rows, and for one that sees mini-batches. Adam's steps do not grow with the gradient:
 # the noise starts closer to the variance of the data, and inducing points are placed once.
@@ -92,7 +107,7 @@ RULES = Rules(
     much_noise=1e3,
     stage=25,
     sample=(1000, 20),
-    exact_sample=(500, 25),
+    exact_sample=(250, 15),
 )
 MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 

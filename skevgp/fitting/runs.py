@@ -8,6 +8,7 @@ import numpy as np
 
 from ..model.parameters import Values
 from ..model.predictor import Predictor
+from ..solvers.coordinates import Metric
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Fit:
     others: tuple[Values, ...] = ()
     # Names of the parameters that had their widest limits.
     widened: tuple[str, ...] = ()
+    # The curvature near its end.
+    metric: Metric | None = None
 
     @property
     def n_iter(self) -> int:
@@ -73,6 +76,8 @@ class Start:
     n_rows: int | None = None
     # Whether the values are a first guess. The curvature of the bound there says little about its end.
     cold: bool = False
+    # The curvature near the values, from an earlier fit.
+    metric: Metric | None = None
 
     @property
     def loss_curve(self) -> list[float]:

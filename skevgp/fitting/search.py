@@ -85,7 +85,17 @@ class Search:
     def _released(self, best: Fit) -> Fit:
         """Continue a fit that ended at a limit, if the table has a wider one."""
         if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
-            best = better(best, self._fit(Start(best.values, self.max_iter, best)))
+            best = better(best, self._fit(Start(best.values, self.max_iter, best, metric=best.metric)))
+        return best
+
+    def _with_noise(self, best: Fit) -> Fit:
+        """Continue a fit that ended almost without noise, if the bound is higher with noise."""
+        low = (best.values["noise"] < self.rules.low_noise * self.model.scatter) & self.table["noise"].free
+        if low.any() and best.n_iter < self.max_iter:
+            noise = np.where(low, 10.0 * self.rules.low_noise * self.model.scatter, best.values["noise"])
+            values = best.values | {"noise": noise}
+            if self.model.bound_at(values) > best.bound + _WORTH:
+                best = better(best, self._fit(Start(values, self.max_iter, best, metric=best.metric)))
         return best
 
     def _climb(self, values: Values) -> Fit:
@@ -102,31 +112,29 @@ class Search:
             if self.collapsed(best):
                 best = self._stages(values, few, n_rows)
             else:
-                best = self._fit(Start(self._shortened(best, values, n_rows), self.max_iter, n_rows=n_rows))
+                best = self._fit(self._continued(best, values, n_rows))
         if not self.collapsed(best):
-            best = self._fit(Start(self._shortened(best, values), self.max_iter))
+            best = self._with_noise(self._fit(self._continued(best, values)))
             if not self.collapsed(best):
                 return best
         return better(best, self._stages(values, self.max_iter))
 
-    def _shortened(self, fit: Fit, first: Values, n_rows: int | None = None) -> Values:
-        """The values of a fit to fewer rows, with the first length scales of columns that more rows show to matter."""
+    def _continued(self, fit: Fit, first: Values, n_rows: int | None = None) -> Start:
+        """The start of a fit to more rows, with the first length scales of columns that these show to matter."""
         # The gradient of a long length scale is almost 0, so that an optimiser does not shorten it. One column after
         # another is tried, and stays short if that raises the bound.
         name, values = "hyperparameters", fit.values
         long = (values[name] > self.rules.longest * first[name]) & self.model.lengthscale_mask
         long &= self.table[name].free.reshape(long.shape)
         columns = np.flatnonzero(long.any(axis=tuple(range(long.ndim - 1))))
-        if len(columns) == 0:
-            return values
-        bound = self.model.bound_at(values, n_rows)
+        bound = self.model.bound_at(values, n_rows) if len(columns) else 0.0
         for column in columns:
             tried = long & (np.arange(long.shape[-1]) == column)
             trial = values | {name: np.where(tried, first[name], values[name])}
             bound_of_trial = self.model.bound_at(trial, n_rows)
             if bound_of_trial > bound + _SEEN:
                 values, bound = trial, bound_of_trial
-        return values
+        return Start(values, self.max_iter, n_rows=n_rows, metric=fit.metric)
 
     def _stages(self, values: Values, max_iter: int, n_rows: int | None = None) -> Fit:
         """Fit in stages: after the first iterations, inducing points are placed again under the learned kernel."""
@@ -143,11 +151,11 @@ class Search:
         ):
             return self._unless_collapsed(values, max_iter, n_rows)
         first, until = self._unless_collapsed(values, stage, n_rows), min(2 * stage, max_iter)
-        best = better(first, self._fit(Start(place(first.values), until, first, n_rows)))
+        best = better(first, self._fit(Start(place(first.values), until, first, n_rows, metric=first.metric)))
         if not first.converged:
-            best = better(best, self._fit(Start(first.values, until, first, n_rows)))
+            best = better(best, self._fit(Start(first.values, until, first, n_rows, metric=first.metric)))
         if not best.converged and best.n_iter < max_iter:
-            best = better(best, self._fit(Start(best.values, max_iter, best, n_rows)))
+            best = better(best, self._fit(Start(best.values, max_iter, best, n_rows, metric=best.metric)))
         return best
 
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Fit:

@@ -11,7 +11,8 @@ import numpy as np
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import check_integer, check_real
-from .base import Callback, Limits, MiniBatchSolver, Minimum, Objective
+from .base import Callback, MiniBatchSolver, Minimum, Objective
+from .coordinates import Limits
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
 # Largest entry of a gradient. The square of a larger one overflows, after which no step moves.

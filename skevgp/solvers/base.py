@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.state import StatefulEstimator
 from ..utils.validation import check_integer, check_real
+from .coordinates import Coordinates, Metric, Scaled
 
 # x -> (loss, gradient); may raise `NotPositiveDefiniteError` or return NaN away from the start.
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 # A loss counts as far if it is this much above the best loss, in units of the size of the best loss plus one.
 _FAR = 10.0
-# Lower and upper limits, each of the shape of x.
-Limits = tuple[np.ndarray, np.ndarray]
 # callback(iteration, lower_bound, outputs)
 Callback = Callable[[int, float, Sequence[int]], object]
 
@@ -30,6 +29,8 @@ class Minimum:
     loss: float
     loss_curve: list[float] = field(default_factory=list)
     converged: bool = False
+    # The curvature near x, of a solver that looks for it.
+    metric: Metric | None = None
     others: tuple[np.ndarray, ...] = ()
 
     @property
@@ -96,25 +97,35 @@ class MiniBatchSolver(Solver):
     natural_gradient: bool = False
 
 
+class Point(NamedTuple):
+    """An evaluation of an objective."""
+
+    x: np.ndarray
+    loss: float
+    gradient: np.ndarray
+
+
 class Guarded:
-    """An objective of x / ``unit`` that never raises nor returns NaN, and keeps the best point so far."""
+    """An objective of z, the coordinates of x, that never raises nor returns NaN. It keeps the best x so far."""
 
     def __init__(self, objective: Objective, start: np.ndarray):
         self._objective = objective
-        self.x, self.loss, self.unit = start.copy(), np.inf, np.ones(len(start))
+        self.x, self.loss = start.copy(), np.inf
+        anywhere = np.full(len(start), np.inf)
+        self.coordinates: Coordinates = Scaled(np.ones(len(start)), (-anywhere, anywhere))
+        self.last = Point(np.full(len(start), np.nan), np.nan, np.zeros(len(start)))
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        x, pull_back = self.coordinates.at(z)
+        # SciPy evaluates its start, which is often the last point.
+        if not np.array_equal(x, self.last.x):
+            self.last = self._evaluated(x)
+        # Points that overflow are recognised by their loss below.
+        with np.errstate(over="ignore", invalid="ignore"):
+            loss, gradient = self.last.loss, pull_back(self.last.gradient)
         # A line search that stepped too far interpolates back. From a loss of 1e10 it would take forever, or end within
         # rounding errors of its start. So losses far above the best are returned on a logarithmic scale, with the
         # gradient to match.
-        x = z * self.unit
-        try:
-            # Points that overflow are recognised by their loss below.
-            with np.errstate(over="ignore", invalid="ignore"):
-                loss, gradient = self._objective(x)
-                gradient = gradient * self.unit
-        except NotPositiveDefiniteError:
-            loss, gradient = np.nan, np.full_like(x, np.nan)
         far = _FAR * (1.0 + abs(self.loss))
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
             return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
@@ -124,3 +135,11 @@ class Guarded:
         if ratio > 1.0:
             return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
         return loss, gradient
+
+    def _evaluated(self, x: np.ndarray) -> Point:
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                loss, gradient = self._objective(x)
+        except NotPositiveDefiniteError:
+            return Point(x.copy(), np.nan, np.full_like(x, np.nan))
+        return Point(x.copy(), loss, gradient.copy())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -12,7 +13,8 @@ from scipy.optimize import OptimizeResult, minimize
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import check_integer
-from .base import Callback, Guarded, Limits, Minimum, Objective, Solver, Tolerance
+from .base import Callback, Guarded, Minimum, Objective, Solver, Tolerance
+from .coordinates import Coordinates, Limits, Metric, Pair, Scaled
 
 # Relative size of a step that changes the loss by its rounding error only.
 _HAIR = 1e-10
@@ -121,6 +123,7 @@ class LBFGS(Solver):
         tolerance: Tolerance,
         monitor: Monitor,
         curvature: tuple[Objective, np.ndarray] | None = None,
+        metric: Metric | None = None,
     ) -> Minimum:
         """Find a minimum by SciPy's L-BFGS-B, started again from the best point when it stalls.
 
@@ -142,6 +145,9 @@ class LBFGS(Solver):
         curvature : tuple, default=None
             Function like ``objective``, whose curvature at the start gives the scale of steps, and an integer for each
             coordinate. Coordinates with the same integer have the same scale. If None, x is not scaled.
+        metric : Metric, default=None
+            Curvature of a similar function near the start. The first start moves along it, and ends the search when
+            neither an iteration gained nor a Newton step promises more than the tolerance.
 
         Returns
         -------
@@ -149,18 +155,24 @@ class LBFGS(Solver):
             Best point, its loss and the loss of each iteration.
         """
         guarded, minimum = Guarded(objective, start), Minimum(start, np.inf)
-        stalled = 0
+        pairs: deque[Pair] = deque(() if metric is None else metric.pairs, maxlen=self.descent.memory)
+        coordinates: Coordinates = Scaled(np.ones(len(start)), limits)
+        stalled, at = 0, guarded.last
 
         def seen(intermediate_result: OptimizeResult) -> None:
             # The loss of the iterate. A point of the line search may have a lower one by chance.
-            nonlocal stalled
+            nonlocal stalled, at
             loss, curve = float(intermediate_result.fun), minimum.loss_curve
             before = curve[-1] if curve else np.inf
             curve.append(loss)
             enough = tolerance.at(loss)
             monitor.iteration(len(curve), loss)
+            if np.array_equal(guarded.last.x, coordinates.at(intermediate_result.x)[0]):
+                pairs.append((guarded.last.x - at.x, guarded.last.gradient - at.gradient))
+                at = guarded.last
             stalled = stalled + 1 if before - loss < enough else 0
-            if stalled >= self.descent.patience:
+            minimum.converged = stalled > 0 and coordinates.promised(at.x, at.gradient) < enough
+            if stalled >= self.descent.patience or minimum.converged:
                 raise StopIteration
 
         with monitor.keeping_the_best():
@@ -168,19 +180,23 @@ class LBFGS(Solver):
             # Without coordinates or iterations the start is the result.
             minimum.converged = len(start) == 0 or max_iter == 0
             x, rng = start, np.random.RandomState(0)
-            for _ in range(max_iter):  # at most: a start whose first line search fails has no iteration
+            for number in range(max_iter):  # at most: a start whose first line search fails has no iteration
                 if minimum.converged or minimum.n_iter >= max_iter:
                     break
-                before, stalled = guarded.loss, 0
+                before, stalled, at = guarded.loss, 0, guarded.last
                 if curvature is not None:
-                    guarded.unit = curvature_units(curvature[0], x, curvature[1], self.descent.probes)
+                    unit = curvature_units(curvature[0], x, curvature[1], self.descent.probes)
+                    coordinates = Scaled(unit, limits)
+                    if number == 0 and metric is not None:
+                        coordinates = metric.coordinates(unit, limits, at.x, at.gradient)
+                guarded.coordinates = coordinates
                 left = max_iter - minimum.n_iter
                 result = minimize(
                     guarded,
-                    x / guarded.unit,
+                    coordinates.of(x),
                     jac=True,
                     method="L-BFGS-B",
-                    bounds=np.column_stack([limit / guarded.unit for limit in limits]),
+                    bounds=coordinates.bounds,
                     callback=seen,
                     options={
                         "maxiter": left,
@@ -200,6 +216,7 @@ class LBFGS(Solver):
                 reach = _HAIR * np.maximum(np.abs(guarded.x), 1.0)
                 x = np.clip(guarded.x + reach * rng.randn(len(x)), *limits)
         minimum.x, minimum.loss = guarded.x, guarded.loss
+        minimum.metric = Metric(tuple(pairs), guarded.x)
         return minimum
 
 

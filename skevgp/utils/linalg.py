@@ -211,7 +211,14 @@ def triangular_solve(L: np.ndarray, B: np.ndarray) -> None:
 
 def symmetric_inverse(L_inv: np.ndarray) -> np.ndarray:
     """Return (L Lᵀ)⁻¹ from L⁻¹."""
-    return L_inv.T @ L_inv
+    if not len(L_inv):
+        return L_inv.copy()
+    # LAPACK computes the lower triangle, with a third of the operations of a symmetric product. The upper one is that
+    # of L⁻¹, which is 0.
+    half = lapack.dlauum(L_inv, lower=1)[0]
+    inverse: np.ndarray = np.add(half, half.T, order="C")
+    diagonal_of(inverse)[...] *= 0.5
+    return inverse
 
 
 def cholesky_pullback(L_inv: np.ndarray, factor_bar: np.ndarray) -> np.ndarray:
