@@ -95,7 +95,7 @@ class Rules:
             return ()
         first = max(self.exact_sample[0], self.exact_sample[1] * n_learned)
         n_stages = max(0, round(np.log2(n_rows / first)))
-        return tuple(np.geomspace(first, n_rows, n_stages + 1)[:-1].astype(int).tolist())
+        return tuple(np.rint(np.geomspace(first, n_rows, n_stages + 1)[:-1]).astype(int).tolist())
 
 
 # Rules for a solver that sees all rows, and for one that sees mini-batches. Adam's steps do not grow with the gradient:

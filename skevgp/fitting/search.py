@@ -85,7 +85,7 @@ class Search:
     def _released(self, best: Fit) -> Fit:
         """Continue a fit that ended at a limit, if the table has a wider one."""
         if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
-            best = better(best, self._fit(Start(best.values, self.max_iter, best, metric=best.metric)))
+            best = better(best, self._fit(Start(best.values, self.max_iter, best)))
         return best
 
     def _with_noise(self, best: Fit) -> Fit:
@@ -95,7 +95,7 @@ class Search:
             noise = np.where(low, 10.0 * self.rules.low_noise * self.model.scatter, best.values["noise"])
             values = best.values | {"noise": noise}
             if self.model.bound_at(values) > best.bound + _WORTH:
-                best = better(best, self._fit(Start(values, self.max_iter, best, metric=best.metric)))
+                best = better(best, self._fit(Start(values, self.max_iter, best)))
         return best
 
     def _climb(self, values: Values) -> Fit:
@@ -151,11 +151,11 @@ class Search:
         ):
             return self._unless_collapsed(values, max_iter, n_rows)
         first, until = self._unless_collapsed(values, stage, n_rows), min(2 * stage, max_iter)
-        best = better(first, self._fit(Start(place(first.values), until, first, n_rows, metric=first.metric)))
+        best = better(first, self._fit(Start(place(first.values), until, first, n_rows)))
         if not first.converged:
-            best = better(best, self._fit(Start(first.values, until, first, n_rows, metric=first.metric)))
+            best = better(best, self._fit(Start(first.values, until, first, n_rows)))
         if not best.converged and best.n_iter < max_iter:
-            best = better(best, self._fit(Start(best.values, max_iter, best, n_rows, metric=best.metric)))
+            best = better(best, self._fit(Start(best.values, max_iter, best, n_rows)))
         return best
 
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Fit:

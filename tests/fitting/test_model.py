@@ -1,13 +1,18 @@
 """The models of a problem: which outputs share what, where each starts, and what a search asks of one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+from skevgp.data.rows import LocalSource
+from skevgp.fitting import rules
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
 from skevgp.fitting.parts import partition_of
 from skevgp.fitting.runs import FeaturesAlone
 from skevgp.model.bounds import Variant, bounds_alone
+from skevgp.model.objectives import BoundObjective
 from skevgp.solvers import LBFGS, Adam
 from skevgp.utils.monitor import Monitor
 
@@ -197,3 +202,21 @@ def test_half_as_many_points_again_come_after_those_of_a_fit_as_far_as_they_may(
     assert growing(most=10, sharing=sharing).with_more(values).n_inducing == 10
     assert growing(most=8, sharing=sharing).with_more(values) is None
     assert model_of(sharing=sharing).with_more(values) is None
+
+
+def test_rows_of_a_sample_count_for_some_that_are_left_out(monkeypatch):
+    """In the smallest sample once, and in one twice as large twice. In larger ones, together as much as all rows."""
+    sampled = replace(rules.RULES, few_rows=0.0, sample=(10, 1), growth=2)
+    monkeypatch.setattr(rules, "RULES", sampled)
+    (model,) = models(sharing="all")
+    assert model.samples[:2] == (10, 20)
+    assert N >= 40
+    for n_rows, count in ((10, 1), (20, 2)):
+        raw = model._sample.source.take(np.arange(n_rows))[np.tile(np.arange(n_rows), count)]
+        repeated = replace(model.rows, source=LocalSource.holding(raw))
+        blocks = model.sparse.blocks(repeated, model.n_inducing)
+        x = model.table.start()
+        expected = BoundObjective(model.sparse, model.table, blocks)(x)
+        for found, wanted in zip(model.objective(model.table, n_rows)(x), expected, strict=True):
+            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    assert model._count(model.samples[-1]) * model.samples[-1] <= N

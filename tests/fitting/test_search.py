@@ -73,7 +73,8 @@ def drive(model, *results, stop_after=None):
         return Fit(values, bound, curve, options.get("converged", True), n_rows=start.n_rows)
 
     # Where a bound alone is asked for, it is recorded as a fit without iterations.
-    model.minimise, model.bound_at = minimise, lambda values, n_rows: minimise(Start(values, 0, n_rows=n_rows)).bound
+    model.minimise = minimise
+    model.bound_at = lambda values, n_rows=None: minimise(Start(values, 0, n_rows=n_rows)).bound
     best = search(model)
     assert not results
     return made, best
@@ -228,6 +229,17 @@ def test_columns_that_more_rows_show_to_matter_get_their_first_length_scale():
     np.testing.assert_allclose(best.values["hyperparameters"], short)
 
 
+@pytest.mark.parametrize(("bound", "starts"), [(3.0, 4), (2.0, 3)])
+def test_fit_that_ended_almost_without_noise_is_tried_with_more(bound, starts):
+    own = model(rules=replace(OWN, much_noise=None), samples=(1000,))
+    quiet = {"noise": 1e-6, "n_iter": 50}
+    ends = [(5.0, GOOD), (2.0, quiet), (bound, GOOD), (4.0, GOOD)][:starts]
+    made, best = drive(own, *ends)
+    np.testing.assert_allclose(made[2].values["noise"], 1e-3)
+    assert [start.until for start in made] == [200, 1000, 0, 1000][:starts]
+    assert best.bound == (4.0 if starts == 4 else 2.0)
+
+
 def test_collapse_on_all_rows_restarts():
     own = model(rules=replace(OWN, other_starts=(), much_noise=None), samples=(1000,))
     made, best = drive(own, (5.0, GOOD), (2.0, COLLAPSED), (3.0, GOOD))
@@ -250,3 +262,12 @@ def test_collapse_on_all_rows_restarts():
 def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, width, sizes):
     assert replace(OWN, sample=(1000, 20)).samples(n_rows, n_inducing, width) == sizes
     assert OWN.samples(n_rows, n_inducing, width) == ()
+
+
+@pytest.mark.parametrize(
+    ("n_rows", "n_learned", "sizes"),
+    [(353, 10, ()), (354, 10, (250,)), (1000, 10, (250, 500)), (2000, 19, (285, 546, 1045)), (2000, 200, ())],
+)
+def test_samples_of_an_exact_fit_are_each_about_twice_as_large(n_rows, n_learned, sizes):
+    assert replace(OWN, exact_sample=(250, 15)).exact_samples(n_rows, n_learned) == sizes
+    assert OWN.exact_samples(n_rows, n_learned) == ()
