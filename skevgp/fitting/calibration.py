@@ -19,7 +19,7 @@ the errors of the groups leave.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -242,6 +242,8 @@ _SQUARES = 0.5
 _INSIDE, _FEWEST_DEGREES = 0.97725, 3.0
 # The best noise for a ratio is searched up to this factor from the one that makes variances as large as squared errors.
 _REACH = 8.0
+# Number of noise variances tried at once.
+_POINTS = 9
 
 
 class Variance(NamedTuple):
@@ -336,21 +338,14 @@ class VarianceSearch:
         if low > high:
             return np.inf, np.nan
         noise = float(np.clip(at_bound, low, high))
+        if np.log(high / low) < _CLOSE:
+            return float(self._losses(ratio, np.array([noise]))[0]), noise
         # If variances were proportional to the noise, this would make squared errors as large as variances.
         excess = float(self._means(ratio, np.array([noise]))[2][0])
         noise = float(np.clip(noise * max(excess, _LOWEST), low, high))
-
-        def loss(log_noise: float) -> float:
-            return float(self._losses(ratio, np.exp([log_noise]))[0])
-
         ends = np.log(np.clip([noise / _REACH, noise * _REACH], low, high))
-        if ends[1] - ends[0] < _CLOSE:
-            return loss(np.log(noise)), noise
-        inside = float(minimize_scalar(loss, bounds=ends, options={"xatol": _CLOSE}).x)
-        # SciPy does not try the ends.
-        candidates = [inside, *(end for end in ends if abs(end - inside) < 2.0 * _CLOSE)]
-        best = min(candidates, key=loss)
-        return loss(best), float(np.exp(best))
+        log_noise, loss = lowest(lambda logs: self._losses(ratio, np.exp(logs)), *ends)
+        return loss, float(np.exp(log_noise))
 
     def _losses(self, ratio: float, noise: np.ndarray) -> np.ndarray:
         """The objective (g,), in nats per row, at noise variances (g,)."""
@@ -374,6 +369,23 @@ class VarianceSearch:
             excess += counts @ scaled
             n += counts.sum()
         return density / n, squares / n, excess / n
+
+
+def lowest(function: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> tuple[float, float]:
+    """The lowest point of a smooth function of many points at once, and its value there."""
+    for _ in range(2):
+        points = np.linspace(low, high, _POINTS)
+        values = function(points)
+        best = int(np.argmin(values))
+        low, high = points[max(best - 1, 0)], points[min(best + 1, _POINTS - 1)]
+    if 0 < best < _POINTS - 1:
+        # The parabola through three points.
+        before, here, after = values[best - 1 : best + 2].tolist()
+        bend, slope = before - 2.0 * here + after, 0.5 * (after - before)
+        if bend > 0.0:
+            step = slope / bend
+            return float(points[best] - step * (points[best + 1] - points[best])), here - 0.5 * slope * step
+    return float(points[best]), float(values[best])
 
 
 def means_of_groups(squares: np.ndarray, counts: np.ndarray, labels: np.ndarray) -> np.ndarray:

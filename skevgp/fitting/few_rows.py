@@ -235,7 +235,8 @@ def _at(energy: Objective, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 def _units(energy: Objective, x: np.ndarray, rng: np.random.RandomState) -> np.ndarray:
     """The scale of each coordinate, 1 / √(∂²energy / ∂x²), as a power of 2."""
-    curvature = np.maximum(curvature_along_axes(lambda x: _at(energy, x)[1], x, _PROBES, rng), _LONGEST**-2)
+    along_axes = curvature_along_axes(lambda x: _at(energy, x)[1], x, _at(energy, x)[1], _PROBES, rng)
+    curvature = np.maximum(along_axes, _LONGEST**-2)
     return np.clip(2.0 ** np.round(-0.5 * np.log2(curvature)), _SHORTEST, _LONGEST)
 
 

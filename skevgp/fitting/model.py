@@ -142,10 +142,11 @@ class Model:
         return min(len(self.rows), n_rows**2 / self.samples[0]) / n_rows
 
     @property
-    def _sampled_all(self) -> bool:
-        """Whether the optimum of the last sample is almost that of all rows."""
-        samples = () if self.is_exact else self.samples
-        return len(samples) > 0 and self._count(samples[-1]) * samples[-1] >= len(self.rows)
+    def samples_agree(self) -> bool:
+        """Whether the optimum of the last sample, and the curvature there, are almost those of all rows."""
+        if self.is_exact or not self.samples:
+            return self.is_exact
+        return self._count(self.samples[-1]) * self.samples[-1] >= len(self.rows)
 
     def objective(self, table: ParameterTable, n_rows: int | None = None) -> Objective:
         """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all.
@@ -382,15 +383,16 @@ class Model:
             tolerance = Tolerance(self.tol / n_rows)
         else:
             share = ENOUGH
-            if start.n_rows is None and not start.cold and self._sampled_all:
+            if start.n_rows is None and not start.cold and self.samples_agree:
                 share *= self.rules.last_share
             tolerance = Tolerance(LEAST_TOL / n_rows, share, -self.bound_alone / n_rows)
-        curvature = None
+        objective, curvature = self.objective(table, start.n_rows), None
         if not start.cold:
             # The curvature on the smallest sample, or on all rows.
-            curvature = self.objective(table, self.samples[0] if self.samples else None), table.alike()
+            few = self.samples[0] if self.samples else None
+            curvature = objective if start.n_rows == few else self.objective(table, few), table.alike()
         minimum = solver.minimise(
-            self.objective(table, start.n_rows),
+            objective,
             table.start(),
             table.limits(),
             start.until - spent,

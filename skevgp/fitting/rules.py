@@ -65,11 +65,13 @@ class Rules:
     # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
     # `LARGEST_SAMPLE`, are left out.
     growth: int = 4
-    # Factor on the tolerance of the last stage, if that of the last sample had almost the same optimum.
+    # Factor on the tolerance of the fit to all rows, if the last sample had almost the same optimum.
     last_share: float = 3.0
     # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
     # first ones. A small sample may not show that a column matters.
-    longest: float = 10.0
+    longest: float = 3.0
+    # The same before a fit to all rows, where a trial costs more.
+    longest_of_all: float = 10.0
     # A fit that ends with noise below this share of the residuals' variance is tried with ten times the share: a small
     # sample may not show noise, and the gradient in the logarithm of a low noise is almost 0.
     low_noise: float = 1e-4
@@ -107,7 +109,7 @@ RULES = Rules(
     much_noise=1e3,
     stage=25,
     sample=(1000, 20),
-    exact_sample=(250, 15),
+    exact_sample=(300, 20),
 )
 MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 

@@ -124,7 +124,8 @@ class Search:
         # The gradient of a long length scale is almost 0, so that an optimiser does not shorten it. One column after
         # another is tried, and stays short if that raises the bound.
         name, values = "hyperparameters", fit.values
-        long = (values[name] > self.rules.longest * first[name]) & self.model.lengthscale_mask
+        longest = self.rules.longest_of_all if n_rows is None else self.rules.longest
+        long = (values[name] > longest * first[name]) & self.model.lengthscale_mask
         long &= self.table[name].free.reshape(long.shape)
         columns = np.flatnonzero(long.any(axis=tuple(range(long.ndim - 1))))
         bound = self.model.bound_at(values, n_rows) if len(columns) else 0.0
@@ -134,7 +135,7 @@ class Search:
             bound_of_trial = self.model.bound_at(trial, n_rows)
             if bound_of_trial > bound + _SEEN:
                 values, bound = trial, bound_of_trial
-        return Start(values, self.max_iter, n_rows=n_rows, metric=fit.metric)
+        return Start(values, self.max_iter, n_rows=n_rows, metric=fit.metric if self.model.samples_agree else None)
 
     def _stages(self, values: Values, max_iter: int, n_rows: int | None = None) -> Fit:
         """Fit in stages: after the first iterations, inducing points are placed again under the learned kernel."""

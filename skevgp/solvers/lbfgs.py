@@ -31,7 +31,7 @@ class Descent:
     memory: int = 100  # number of pairs of steps and gradients for the curvature
     gradient: float = 1e-9  # a start ends if no entry of the gradient is larger
     patience: int = 3  # number of iterations in a row with less gain than the tolerance that count as a stall
-    probes: int = 8  # number of pairs of gradients for the units of the coordinates
+    probes: int = 3  # number of pairs of gradients for the units of the coordinates
 
 
 class LBFGS(Solver):
@@ -185,7 +185,9 @@ class LBFGS(Solver):
                     break
                 before, stalled, at = guarded.loss, 0, guarded.last
                 if curvature is not None:
-                    unit = curvature_units(curvature[0], x, curvature[1], self.descent.probes)
+                    function, alike = curvature
+                    here = at.gradient if function is objective and np.array_equal(at.x, x) else None
+                    unit = curvature_units(function, x, alike, self.descent.probes, here)
                     coordinates = Scaled(unit, limits)
                     if number == 0 and metric is not None:
                         coordinates = metric.coordinates(unit, limits, at.x, at.gradient)
@@ -220,10 +222,16 @@ class LBFGS(Solver):
         return minimum
 
 
-def curvature_units(objective: Objective, x: np.ndarray, alike: np.ndarray, n_probes: int) -> np.ndarray:
-    """Return a step size for each coordinate, 1 / √|∂²loss/∂x²|, averaged over equal integers in ``alike``."""
+def curvature_units(
+    objective: Objective, x: np.ndarray, alike: np.ndarray, n_probes: int, here: np.ndarray | None = None
+) -> np.ndarray:
+    """Return a step size for each coordinate, 1 / √|∂²loss/∂x²|, averaged over equal integers in ``alike``.
+
+    ``here`` is the gradient at x if it is known.
+    """
     try:
-        along_axes = curvature_along_axes(lambda x: objective(x)[1], x, n_probes, np.random.RandomState(0))
+        here = objective(x)[1] if here is None else here
+        along_axes = curvature_along_axes(lambda x: objective(x)[1], x, here, n_probes, np.random.RandomState(0))
     except NotPositiveDefiniteError:
         return np.ones(len(x))
     kinds, kind = np.unique(alike, return_inverse=True)
@@ -234,13 +242,17 @@ def curvature_units(objective: Objective, x: np.ndarray, alike: np.ndarray, n_pr
 
 
 def curvature_along_axes(
-    gradient: Callable[[np.ndarray], np.ndarray], x: np.ndarray, n_probes: int, rng: np.random.RandomState
+    gradient: Callable[[np.ndarray], np.ndarray],
+    x: np.ndarray,
+    here: np.ndarray,
+    n_probes: int,
+    rng: np.random.RandomState,
 ) -> np.ndarray:
     """Estimate |∂²loss/∂x²| of each coordinate from differences of gradients."""
     # The diagonal of the Hessian from differences of gradients along random signs v: the mean of
     # v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). Entries
     # off the diagonal add to its size by chance.
-    total, here = np.zeros(len(x)), gradient(x)
+    total = np.zeros(len(x))
     for _ in range(n_probes):
         signs = rng.choice([-1.0, 1.0], len(x))
         there = gradient(x + _STEP * signs)

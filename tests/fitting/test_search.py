@@ -40,6 +40,7 @@ def model(**changes):
         "alone": FeaturesAlone(-np.inf, np.ones(2)),
         "interpolates": False,
         "samples": (),
+        "samples_agree": False,
         "lengthscale_mask": np.array([True, False]),
         "place": None,
         "warm": None,
@@ -70,7 +71,8 @@ def drive(model, *results, stop_after=None):
         if "signal" in options:
             values["signal"] = np.array(options["signal"])
         curve = [0.0] * options.get("n_iter", start.until)
-        return Fit(values, bound, curve, options.get("converged", True), n_rows=start.n_rows)
+        seen = {"metric": options.get("metric"), "n_rows": start.n_rows}
+        return Fit(values, bound, curve, options.get("converged", True), **seen)
 
     # Where a bound alone is asked for, it is recorded as a fit without iterations.
     model.minimise = minimise
@@ -211,6 +213,13 @@ def test_fit_climbs_from_sample_to_sample_to_all_rows():
         assert later.after is None
     # A fit to more rows is the better one, whatever the bounds of samples.
     assert (best.bound, best.n_rows) == (2.0, None)
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_fit_to_more_rows_moves_along_the_curvature_of_a_sample_that_agrees(agree):
+    own = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000), samples_agree=agree)
+    made, _ = drive(own, (5.0, {"metric": "of 1000"}), (4.0, {"metric": "of 4000"}), (3.0, GOOD))
+    assert [start.metric for start in made] == ([None, "of 1000", "of 4000"] if agree else 3 * [None])
 
 
 def test_columns_that_more_rows_show_to_matter_get_their_first_length_scale():
