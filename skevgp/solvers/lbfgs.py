@@ -56,6 +56,7 @@ class LBFGS(Solver):
     tol : float or "auto", default="auto"
         Tolerance in nats. L-BFGS restarts from its best point when three iterations in a row gain less, and stops when
         a restart gains no more. If ``"auto"``, 0.0015 % of the gain over features and noise alone, and at least 0.01.
+        It is three times as much after a large sample, see :doc:`/guide/solvers`.
     max_time : float, default=None
         Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
         calibration by ``noise_cv`` is skipped, as is the average over kernels of a fit to few rows. If None, there is
