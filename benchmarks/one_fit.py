@@ -4,7 +4,8 @@
     PYTHONPATH=../older python benchmarks/one_fit.py ur10e 0 --data ../data
     python benchmarks/one_fit.py pendulum 0 --quick
 
-Jobs are simulated systems (with "-noise": with 1 % of noise), tables, and torques of a real arm (see `robots.py`).
+Jobs are simulated systems (with "-noise": with 1 % of noise), tables, a million rows, and torques of a real arm (see
+`robots.py`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from sklearn.datasets import load_diabetes, make_friedman1
 from sklearn.model_selection import train_test_split
 from sklearn.preprocessing import PolynomialFeatures
 
+import harness
 from robots import rows_of, urdf_of
 from skevgp import EVGPRegressor, InverseDynamics
 from skevgp.datasets import make_dynamics, make_toy
@@ -30,6 +32,7 @@ from skevgp.metrics import negative_log_predictive_density, prediction_error
 # Numbers of inducing points, and of trajectories if they are not all of the paper's.
 SYSTEMS = {"pendulum": (10, None), "cartpole": (60, None), "acrobot": (150, None), "iiwa14": (100, 100)}
 TABLES = ("friedman", "diabetes", "toy")
+OTHER_JOBS = ("ur10e", "million")
 JOBS = (*SYSTEMS, *(f"{system}-noise" for system in SYSTEMS if system != "iiwa14"), *TABLES)
 
 # Model, arguments of fit, X and y of new rows.
@@ -57,6 +60,14 @@ def table(job: str, seed: int) -> Job:
     return EVGPRegressor(features, n_inducing=50, random_state=seed), {"X": X, "y": y}, X_test, y_test
 
 
+def many_rows(seed: int, quick: bool) -> Job:
+    """Rows of 6 columns, on all cores."""
+    n = 20_000 if quick else 1_000_000
+    X, y, _ = next(harness.noisy_waves(n + 10_000, 6, np.random.RandomState(seed)))
+    model = EVGPRegressor(n_inducing=100, n_jobs=-1, random_state=seed)
+    return model, {"X": X[:n], "y": y[:n]}, X[n:], y[n:]
+
+
 def arm(seed: int, folder: Path, quick: bool) -> Job:
     """Two moves of the UR10e, and a third one."""
     size = "quick" if quick else "full"
@@ -68,12 +79,14 @@ def arm(seed: int, folder: Path, quick: bool) -> Job:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("job", choices=[*JOBS, "ur10e"])
+    parser.add_argument("job", choices=[*JOBS, *OTHER_JOBS])
     parser.add_argument("seed", type=int)
     parser.add_argument("--data", type=Path, help="of ur10e: a folder with a folder ur10e")
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
-    if options.job == "ur10e":
+    if options.job == "million":
+        model, rows, X, y = many_rows(options.seed, options.quick)
+    elif options.job == "ur10e":
         model, rows, X, y = arm(options.seed, options.data, options.quick)
     elif options.job in TABLES:
         model, rows, X, y = table(options.job, options.seed)

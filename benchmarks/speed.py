@@ -11,6 +11,7 @@
     python benchmarks/speed.py checkout --other ../older   # fits by this checkout and by another one, in pairs
 
     python benchmarks/speed.py checkout --other ../older --data ../data   # also torques of a real arm
+    python benchmarks/speed.py checkout --other ../older --fits-of million --seeds 1    # a million rows: 10 minutes
 
 Each part takes seconds with --quick.
 
@@ -60,7 +61,7 @@ from threadpoolctl import threadpool_limits
 
 import harness
 from harness import figure_of
-from one_fit import JOBS
+from one_fit import JOBS, OTHER_JOBS
 from peers.adapters import microseconds
 from peers.against_peers import work
 from skevgp import EGPRegressor, EVGPRegressor
@@ -596,7 +597,9 @@ def main() -> None:
     parser.add_argument("--peer-python", help="of latency: a Python that has GPflow and GPyTorch")
     parser.add_argument("--fits", nargs="+", choices=FITS, help="of million; default: all but the reference")
     parser.add_argument("--other", type=Path, help="of checkout: folder of the other checkout; default: this one")
-    parser.add_argument("--fits-of", nargs="+", dest="jobs_of_checkout", choices=[*JOBS, "ur10e"], help="of checkout")
+    parser.add_argument(
+        "--fits-of", nargs="+", dest="jobs_of_checkout", choices=[*JOBS, *OTHER_JOBS], help="of checkout"
+    )
     parser.add_argument("--data", type=Path, help="of checkout: a folder with the logs of the UR10e (see robots.py)")
     options = harness.parse(parser)
     name, cells, run, tables_of, title = PARTS[options.part]
