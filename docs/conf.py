@@ -105,6 +105,6 @@ ALONE = [
     "changelog",
     "generated/source/*",
 ]
-ALONE += ["from_0_1_to_0_2"]
+ALONE += ["from_0_1_to_0_2", "from_0_2_to_0_3"]
 ALONE += ["benchmarks", "generated/results/*", "auto_examples/*"]
 html_sidebars = {page: [] for page in [*ALONE, "questions"]}

@@ -252,7 +252,7 @@ def _opened(data: bytes, trusted: Sequence[str]) -> tuple[Any, bool, dict[str, A
         raise ValueError(f"it has format {about['format']} of {_told(about)}, and skevgp {__version__} reads {_FORMAT}")
     try:
         with ignored(), np.errstate(all="ignore"), parallel_config("sequential"):
-            return *_made(data, [*TRUSTED_TYPES, *trusted]), about
+            return *_made(data, [*TRUSTED_TYPES, *trusted], about), about
     except ImportError:
         raise
     except Exception as error:
@@ -261,15 +261,15 @@ def _opened(data: bytes, trusted: Sequence[str]) -> tuple[Any, bool, dict[str, A
         raise ValueError(f"{_said(error)} (saved with {_told(about)}; here: {_told(_about())})") from error
 
 
-def _made(data: bytes, trusted: list[str]) -> tuple[Any, bool]:
+def _made(data: bytes, trusted: list[str], about: dict[str, Any]) -> tuple[Any, bool]:
     """Return the model of a file, and whether its predictions were compared."""
     skops = require("skops.io", "Loading a model")
     needed = skops.get_untrusted_types(data=data)
     if unknown := sorted(set(needed) - set(trusted)):
-        raise ValueError(
-            f"it holds {', '.join(unknown[:20])}, which is not trusted by default. If you trust its code, name it in "
-            "trusted=[...]"
-        )
+        held = f"it holds {', '.join(unknown[:20])}, which"
+        if about.get("skevgp") != __version__ and any(name.startswith("skevgp.") for name in unknown):
+            raise ValueError(f"{held} this version does not have. Fit the model again, or load it with the old version")
+        raise ValueError(f"{held} is not trusted by default. If you trust its code, name it in trusted=[...]")
     content = skops.loads(data, trusted=needed)  # skops copies the list for each part of the model
     if type(content) is not dict or content.keys() != {"model", "trial"}:
         raise ValueError("it is not a file of skevgp.io.save")

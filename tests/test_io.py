@@ -314,6 +314,15 @@ def test_changed_predictions_raise(path):
         load(path)
 
 
+def test_classes_of_another_version_raise(path, monkeypatch):
+    path.write_bytes(saved("plain"))
+    content = content_of(path)
+    monkeypatch.setattr("skevgp.io.TRUSTED_TYPES", [name for name in TRUSTED_TYPES if "Fitted" not in name])
+    write_content(path, content, skevgp="0.2.0")
+    with pytest.raises(ValueError, match=r"holds skevgp\.\S*Fitted.* does not have\. Fit .* skevgp 0\.2\.0"):
+        load(path)
+
+
 def test_other_sklearn_version_warns(path):
     path.write_bytes(saved("plain"))
     content, other = content_of(path), {"scikit-learn": "0.1"}

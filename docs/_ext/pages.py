@@ -36,7 +36,6 @@ SOURCE_ROLE = re.compile(r"(?:\{src\}|:src:)`([^`]+)`")
 LINK = re.compile(r"(!?)\[([^\[\]]*)\]\((?!https?:|#)([^)#\s]+)(#[^)]*)?\)")
 # Pages of the site that stand for files of the repository.
 PAGES = {"README.md": "/index", "REPRODUCTION.md": "/reproduction", "CHANGELOG.md": "/changelog"}
-PAGES["docs/from_0_1_to_0_2.md"] = "/from_0_1_to_0_2"
 # What public functions return, and users therefore meet.
 RETURNED = {"skevgp.control.compiled": ["CompiledPredictor"], "skevgp.control.acados": ["L4acadosModel"]}
 

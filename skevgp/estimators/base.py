@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
-from inspect import signature
-from typing import Any, Literal, ParamSpec, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +28,6 @@ from ..utils.state import StatefulEstimator
 from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
 from .summary import ModelSummary, html_of, of_gaussian_process
 
-P = ParamSpec("P")
 # Attributes of models with weights only.
 _OF_WEIGHTS = (
     "coef_",
@@ -45,35 +42,6 @@ _OF_WEIGHTS = (
 _OF_THETA = ("theta_", "theta_std_", "theta_cov_")
 # Attributes that are computed when they are read.
 _AFTER_FIT = ("lower_bound_", "upper_bound_")
-# Arguments of version 0.1, and their new places.
-_MOVED = {
-    "coef_mean": "coef_prior=skevgp.CoefPrior(mean=...)",
-    "coef_scale": "coef_prior=skevgp.CoefPrior(scale=...)",
-    "coef_cov": "coef_prior=skevgp.CoefPrior(cov=...)",
-    "share_coef": "coef_prior=skevgp.CoefPrior(shared=...)",
-    "noise_variance": "noise=skevgp.noise.Gaussian(variance=...)",
-    "input_noise": "noise=skevgp.noise.Gaussian(inputs=...)",
-    "posterior": "solver=skevgp.solvers.LBFGS(posterior=...), or Adam(posterior=...)",
-    "tol": "solver=skevgp.solvers.LBFGS(tol=...), or Adam(tol=...)",
-    "max_time": "solver=skevgp.solvers.LBFGS(max_time=...), or Adam(max_time=...)",
-    "max_inducing": "solver=skevgp.solvers.LBFGS(max_inducing=...)",
-    "forgetting_factor": "partial_fit(X, y, forgetting_factor=...)",
-}
-
-
-def names_moved_arguments(init: Callable[P, None]) -> Callable[P, None]:
-    """Decorate an ``__init__`` so that errors on arguments of version 0.1 name their new place."""
-    known = signature(init).parameters
-
-    @wraps(init)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> None:
-        for name in kwargs:
-            if name in _MOVED and name not in known:
-                kind = type(args[0]).__name__
-                raise TypeError(f"{kind} has no argument {name!r} since version 0.2: use {_MOVED[name]}.")
-        init(*args, **kwargs)
-
-    return checked
 
 
 class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):

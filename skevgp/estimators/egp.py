@@ -36,7 +36,7 @@ from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor, monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import LARGEST, as_floats, check_fitted, is_dask, unchanged_if_it_fails
-from .base import GaussianProcess, names_moved_arguments
+from .base import GaussianProcess
 
 # Number of rows up to which an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
@@ -179,7 +179,6 @@ class EGPRegressor(GaussianProcess):
         "verbose": ["verbose"],
     }
 
-    @names_moved_arguments
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,

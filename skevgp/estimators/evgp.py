@@ -45,7 +45,7 @@ from ..utils.validation import (
     unchanged_if_it_fails,
     words_of,
 )
-from .base import GaussianProcess, names_moved_arguments
+from .base import GaussianProcess
 
 
 class EVGPRegressor(GaussianProcess):
@@ -200,7 +200,6 @@ class EVGPRegressor(GaussianProcess):
         "verbose": ["verbose"],
     }
 
-    @names_moved_arguments
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,
