@@ -246,3 +246,15 @@ def test_column_that_a_sample_misses_is_learned():
     y = signal + rng.standard_normal(6000)
     model = EVGPRegressor(n_inducing=40, noise_cv=None, random_state=1).fit(X[:5000], y[:5000])
     assert model.score(X[5000:], signal[5000:]) > 0.95
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_short_waves_are_not_taken_for_noise(seed):
+    """A product of waves along two columns, beside a column with a line and one of zeros and ones."""
+    rng = np.random.default_rng(seed)
+    n = 3200
+    X = np.column_stack([rng.uniform(0.0, 4.0, (n, 2)), rng.lognormal(4.5, 0.4, n), rng.integers(0, 2, n)])
+    y = 5.0 * np.sin(3.0 * X[:, 0]) * np.cos(3.0 * X[:, 1]) + 0.05 * X[:, 2] + 3.0 * X[:, 3]
+    y += rng.standard_normal(n)
+    model = EVGPRegressor(normalize_y=True, random_state=0, noise_cv=None).fit(X, y)
+    assert model.noise_variance_ == pytest.approx(1.0, abs=0.4)

@@ -49,6 +49,9 @@ class Rules:
     collapsed: float = 0.9
     # Starts after a collapsed fit: factors on the first length scales and the first noise variance.
     other_starts: tuple[tuple[float, float], ...] = ()
+    # A second start with shorter length scales: a factor on the first ones, and the share of the residuals' variance
+    # that the noise must exceed. At long length scales, the gradient does not show waves that are much shorter.
+    short: tuple[float, float] | None = None
     # Whether a fit that ended below the features alone starts once more, from the noise that is best for these.
     last_start: bool = True
     # Factor on the first noise for a second start, tried on a sample or with a point for each row, where it costs
@@ -107,6 +110,7 @@ RULES = Rules(
     lowest_noise_exact=LOWEST_NOISE_EXACT,
     other_starts=((0.5, 1.0), (2.0, 100.0), (1.0, 1e3)),
     much_noise=1e3,
+    short=(0.3, 0.25),
     stage=25,
     sample=(1000, 20),
     exact_sample=(300, 20),

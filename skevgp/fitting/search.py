@@ -176,6 +176,10 @@ class Search:
             best = better(best, self._fit(start))
             if everything:
                 starts = [factors for factors in starts if factors != (1.0, much)]
+        if self.rules.short is not None and selected is None:
+            factor, share = self.rules.short
+            if (best.values["noise"] > share * self.model.scatter).any():
+                best = better(best, self._fit(Start(multiplied(values, factor, 1.0), until, None, n_rows, cold=True)))
         for factors in starts:
             if not self.collapsed(best):
                 break

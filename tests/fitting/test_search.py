@@ -249,6 +249,15 @@ def test_fit_that_ended_almost_without_noise_is_tried_with_more(bound, starts):
     assert best.bound == (4.0 if starts == 4 else 2.0)
 
 
+@pytest.mark.parametrize(("noise", "bounds", "kept"), [(0.3, (2.0, 3.0), 1), (0.3, (2.0, 1.0), 0), (0.2, (2.0,), 0)])
+def test_shorter_length_scales_are_tried_if_much_noise_is_left(noise, bounds, kept):
+    own = model(rules=replace(OWN, much_noise=None, short=(0.5, 0.25)))
+    made, best = drive(own, *((bound, {"noise": noise}) for bound in bounds))
+    lengths = [start.values["hyperparameters"] for start in made]
+    np.testing.assert_allclose(lengths, [[2.0, 3.0], [1.0, 1.5]][: len(bounds)])
+    np.testing.assert_array_equal(best.values["hyperparameters"], lengths[kept])
+
+
 def test_collapse_on_all_rows_restarts():
     own = model(rules=replace(OWN, other_starts=(), much_noise=None), samples=(1000,))
     made, best = drive(own, (5.0, GOOD), (2.0, COLLAPSED), (3.0, GOOD))
