@@ -1,0 +1,186 @@
+"""The double pendulum of RealAIGym in simulation: acrobot and pendubot, many plants at once.
+
+`plot_double_pendulum.py` and `benchmarks/realaigym.py` use this module. The numbers of the robot and of its disturbances
+are those of the public repository dfki-ric-underactuated-lab/double_pendulum. Angles are 0 where the arm hangs, and the
+second one is relative to the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+# Step of the simulation and of the controller, s; number of steps of a run; limit of the torque, N m.
+STEP, N_STEPS, LIMIT = 0.002, 5000, 6.0
+GRAVITY, GEAR = 9.81, 6.0
+LENGTHS = 0.2, 0.3
+# Joint with the motor.
+DRIVEN = {"acrobot": 1, "pendubot": 0}
+GOAL = np.array([np.pi, 0.0, 0.0, 0.0])
+# The arm is upright within these distances, rad and rad/s.
+NEAR = np.array([0.35, 0.35, 1.0, 1.0])
+
+# A controller gets the number of the step and measured states (n_plants, 4), and returns torques (n_plants,).
+Controller = Callable[[int, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Plants:
+    """Numbers of one robot or of many. Each is a number or an array (n_plants,). Inertias are about the joints."""
+
+    robot: str
+    m1: Any = 0.5234602302310271
+    m2: Any = 0.6255677234174437
+    r1: Any = 0.2
+    r2: Any = 0.25569305436052964
+    I1: Any = 0.031887199591513114
+    I2: Any = 0.05086984812807257
+    b1: Any = 0.0
+    b2: Any = 0.0
+    cf1: Any = 0.0
+    cf2: Any = 0.0
+    rotor: Any = 0.0
+
+    def accelerations(self, z: np.ndarray, tau1: Any, tau2: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return both accelerations of states (4, n) under torques on the joints."""
+        l1 = LENGTHS[0]
+        q1, q2, v1, v2 = z
+        h = self.m2 * l1 * self.r2
+        sin2, cos2 = np.sin(q2), np.cos(q2)
+        hc = h * cos2
+        M01 = self.I2 + hc - GEAR * self.rotor
+        M11 = self.I2 + GEAR**2 * self.rotor
+        M00 = self.I1 + self.I2 + self.m2 * l1**2 + 2.0 * hc + (GEAR**2 + 1.0) * self.rotor
+        tip = self.m2 * self.r2 * GRAVITY * np.sin(q1 + q2)
+        hs = h * sin2
+        f1 = tau1 + hs * v2 * (2.0 * v1 + v2) - (self.m1 * self.r1 + self.m2 * l1) * GRAVITY * np.sin(q1) - tip
+        f2 = tau2 - hs * v1**2 - tip
+        if np.any(self.b1) or np.any(self.cf1):
+            f1 = f1 - self.b1 * v1 - self.cf1 * np.arctan(100.0 * v1)
+        if np.any(self.b2) or np.any(self.cf2):
+            f2 = f2 - self.b2 * v2 - self.cf2 * np.arctan(100.0 * v2)
+        determinant = M00 * M11 - M01**2
+        return (M11 * f1 - M01 * f2) / determinant, (M00 * f2 - M01 * f1) / determinant
+
+    def rate(self, z: np.ndarray, tau1: Any, tau2: Any) -> np.ndarray:
+        return np.stack([z[2], z[3], *self.accelerations(z, tau1, tau2)])
+
+    def advance(self, z: np.ndarray, tau1: Any, tau2: Any, h: float = STEP) -> np.ndarray:
+        """Return states (4, n) after a Runge-Kutta step."""
+        first = self.rate(z, tau1, tau2)
+        second = self.rate(z + 0.5 * h * first, tau1, tau2)
+        third = self.rate(z + 0.5 * h * second, tau1, tau2)
+        fourth = self.rate(z + h * third, tau1, tau2)
+        return z + h / 6.0 * (first + 2.0 * (second + third) + fourth)
+
+    def torques(self, u: Any) -> tuple[Any, Any]:
+        """Return the torques on both joints by that of the motor."""
+        return (u, 0.0) if DRIVEN[self.robot] == 0 else (0.0, u)
+
+    def energy(self, z: np.ndarray) -> np.ndarray:
+        """Return kinetic and potential energy of states (4, n), J."""
+        l1 = LENGTHS[0]
+        q1, q2, v1, v2 = z
+        hc = self.m2 * l1 * self.r2 * np.cos(q2)
+        M00, M01 = self.I1 + self.I2 + self.m2 * l1**2 + 2.0 * hc, self.I2 + hc
+        kinetic = 0.5 * (M00 * v1**2 + self.I2 * v2**2) + M01 * v1 * v2
+        heights = -(self.m1 * self.r1 + self.m2 * l1) * np.cos(q1) - self.m2 * self.r2 * np.cos(q1 + q2)
+        return kinetic + GRAVITY * heights
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """What disturbs each plant: numbers, or arrays (n_plants,).
+
+    Attributes
+    ----------
+    velocity_noise, torque_noise : standard deviations, rad/s and N m
+    position_noise : standard deviation, rad
+    response : share of the way to a new torque that the motor goes in a step
+    delay : int
+        Number of steps by which measured states are late.
+    pulses : ndarray of shape (2, n_steps, n_plants) or None
+        Torques on both joints that are added, N m.
+    """
+
+    velocity_noise: Any = 0.0
+    torque_noise: Any = 0.0
+    position_noise: Any = 0.0
+    response: Any = 1.0
+    delay: Any = 0
+    pulses: np.ndarray | None = None
+
+
+def simulate_plants(
+    plants: Plants,
+    controller: Controller,
+    starts: np.ndarray,
+    disturbances: Disturbances = Disturbances(),
+    n_steps: int = N_STEPS,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Simulate plants from states (n_plants, 4).
+
+    Returns
+    -------
+    states : ndarray of shape (n_steps + 1, n_plants, 4)
+    torques : ndarray of shape (n_steps, n_plants)
+        Commanded torques, within the limit.
+    """
+    rng, n = np.random.RandomState(seed), len(starts)
+    noise = np.stack([np.broadcast_to(disturbances.position_noise, n), np.broadcast_to(disturbances.velocity_noise, n)])
+    noise, is_noisy = np.repeat(noise, 2, axis=0), np.any(noise)
+    shaken, delay = np.any(disturbances.torque_noise), np.broadcast_to(disturbances.delay, n)
+    states, commands, last = np.empty((n_steps + 1, n, 4)), np.empty((n_steps, n)), np.zeros(n)
+    states[0], every, z = starts, np.arange(n), np.array(starts.T, dtype=float)
+    for step in range(n_steps):
+        measured = states[np.maximum(step - delay, 0), every]
+        if is_noisy:
+            measured = measured + (noise * rng.standard_normal((4, n))).T
+        commands[step] = np.clip(controller(step, measured), -LIMIT, LIMIT)
+        u = last + disturbances.response * (commands[step] - last)
+        if shaken:
+            u = u + disturbances.torque_noise * rng.standard_normal(n)
+        u = np.clip(u, -LIMIT, LIMIT)
+        tau = plants.torques(u)
+        if disturbances.pulses is not None:
+            tau = tau[0] + disturbances.pulses[0, step], tau[1] + disturbances.pulses[1, step]
+        last = tau[DRIVEN[plants.robot]]  # the motor's next torque starts from all of the last one, as in RealAIGym
+        z = plants.advance(z, *tau)
+        states[step + 1] = z.T
+    return states, commands
+
+
+def is_upright(states: np.ndarray) -> np.ndarray:
+    """Whether states (..., 4) are near the goal, after any number of turns."""
+    return np.all(np.abs(difference(states, GOAL)) < NEAR, axis=-1)
+
+
+def difference(z: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return z - other, with angles from -pi to pi."""
+    found = z - other
+    found[..., :2] -= 2.0 * np.pi * np.round(found[..., :2] / (2.0 * np.pi))
+    return found
+
+
+class Truth:
+    """The simulated robot as a model of the state after a longer step, with the methods of `CompiledPredictor`."""
+
+    def __init__(self, plants: Plants, dt: float = 0.01):
+        self.plants, self.n_substeps, self.h = plants, max(round(dt / 0.005), 1), dt / max(round(dt / 0.005), 1)
+
+    def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
+        rows = np.moveaxis(X, -1, 0)
+        z, tau = rows[:4], self.plants.torques(rows[4])
+        for _ in range(self.n_substeps):
+            z = self.plants.advance(z, *tau, h=self.h)
+        found = np.moveaxis(z, 0, -1)
+        return (found, np.zeros_like(found)) if return_std else found
+
+    def value_and_jacobian(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        steps = 1e-6 * np.eye(5)
+        slopes = [(self.predict(X + step) - self.predict(X - step)) / 2e-6 for step in steps]
+        return self.predict(X), np.stack(slopes, axis=-1)
