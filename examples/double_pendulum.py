@@ -7,11 +7,24 @@ second one is relative to the first.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
 import numpy as np
+from sklearn.pipeline import make_union
+from sklearn.utils import Bunch
+
+from mpc import Follower, Library, Reach
+from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp.datasets import load_log, log_transitions
+from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LogNormal, NominalDynamics
+from skevgp.robots.systems import GravityTerm, Link, System
 
 # Step of the simulation and of the controller, s; number of steps of a run; limit of the torque, N m.
 STEP, N_STEPS, LIMIT = 0.002, 5000, 6.0
@@ -184,3 +197,156 @@ class Truth:
         steps = 1e-6 * np.eye(5)
         slopes = [(self.predict(X + step) - self.predict(X - step)) / 2e-6 for step in steps]
         return self.predict(X), np.stack(slopes, axis=-1)
+
+
+# --- data and models ---------------------------------------------------------------------------------------------------
+
+# Noise of the sensors, rad and rad/s. A run ends at this speed, rad/s, as on the real robot.
+SENSORS = Disturbances(position_noise=1e-3, velocity_noise=0.05)
+FASTEST = 30.0
+# Rows of 500 Hz from a state to the next.
+STRIDE = 5
+DT = STRIDE * STEP
+
+TASK = Reach(
+    goal=tuple(GOAL),
+    angles=(0, 1),
+    limit=LIMIT,
+    dt=DT,
+    weights=(0.3, 0.3, 0.3, 0.3, 0.03, 0.03, 0.1),
+    last_weights=(30.0, 30.0, 30.0, 30.0, 6.0, 6.0),
+    state_cost=(0.64, 0.56, 0.13, 0.037),
+    input_cost=0.82,
+    top_state_cost=(0.97, 0.93, 0.39, 0.26),
+    top_input_cost=0.11,
+)
+
+# Measured states (n_steps, 4) and commanded torques (n_steps,) of one run.
+Run = tuple[np.ndarray, np.ndarray]
+
+
+def record(robot: str, controller: Controller, starts: np.ndarray, n_steps: int, seed: int) -> list[Run]:
+    """Return runs of the true robot from states (n_runs, 4), as its sensors see them, until it is too fast."""
+    measured = []
+
+    def watched(step: int, Z: np.ndarray) -> np.ndarray:
+        measured.append(Z)
+        return controller(step, Z)
+
+    _, torques = simulate_plants(Plants(robot), watched, starts, SENSORS, n_steps, seed)
+    states, runs = np.array(measured), []
+    for number in range(len(starts)):
+        fast = np.flatnonzero(np.any(np.abs(states[:, number, 2:]) > FASTEST, axis=1))
+        end = fast[0] if len(fast) else n_steps
+        runs.append((states[:end, number], torques[:end, number]))
+    return runs
+
+
+def random_torques(n_steps: int, n: int, size: float, rng: np.random.RandomState) -> np.ndarray:
+    """Return torques (n_steps, n) that are lines between random values."""
+    t, found = STEP * np.arange(n_steps), np.empty((n_steps, n))
+    for number in range(n):
+        times = np.arange(0.0, t[-1] + 1.0, rng.uniform(0.1, 0.5))
+        found[:, number] = np.interp(t, times, rng.uniform(0.3, 1.0) * size * rng.uniform(-1.0, 1.0, len(times)))
+    return found
+
+
+def explore(robot: str, seconds: float, seed: int) -> list[Run]:
+    """Record runs of a second with random torques, half of them from hanging and half from random states."""
+    rng, n, n_steps = np.random.RandomState(seed), round(seconds), round(1.0 / STEP)
+    starts, half = np.zeros((n, 4)), n // 2
+    starts[half:] = np.hstack([rng.uniform(-np.pi, np.pi, (n - half, 2)), rng.uniform(-8.0, 8.0, (n - half, 2))])
+    torques = random_torques(n_steps, n, 0.5 * LIMIT, rng)
+    return record(robot, lambda step, Z: torques[step], starts, n_steps, seed)
+
+
+def practise(robot: str, library: Library, seconds: float, seed: int) -> list[Run]:
+    """Record runs of the controller with small random torques: some from hanging, others of a second near its plan."""
+    rng = np.random.RandomState(seed)
+    n_whole = max(round(0.5 * seconds / 2.5), 1)
+    n = round(seconds - 2.5 * n_whole)
+    first = rng.randint(0, library.horizon, n)
+    starts = np.where(rng.uniform(size=(n, 1)) < 0.2, GOAL, library.Z[first])
+    starts = starts + rng.standard_normal((n, 4)) * [0.1, 0.1, 0.5, 0.5]
+    runs = []
+    for nodes, states, duration in ((None, np.zeros((n_whole, 4)), 2.5), (first, starts, 1.0)):
+        if not len(states):
+            continue
+        n_steps = round(duration / STEP)
+        shakes = random_torques(n_steps, len(states), 1.0, rng) * rng.uniform(size=len(states))
+        shakes[:, 0] = 0.0
+        follower = Follower(library, len(states), STEP, nodes=nodes)
+        runs += record(
+            robot, lambda step, Z, own=follower, more=shakes: own(step, Z) + more[step], states, n_steps, seed
+        )
+    return runs
+
+
+def transitions(robot: str, runs: list[Run]) -> Bunch:
+    """Write the runs to a log, with pauses between them, and read state transitions of 0.01 s from it."""
+    rows, starts, now = [], [], 0.0
+    for states, torques in runs:
+        tau = np.zeros((len(states), 2))
+        tau[:, DRIVEN[robot]] = torques
+        rows.append(np.column_stack([now + STEP * np.arange(len(states)), states, tau]))
+        starts.append(now)
+        now += STEP * len(states) + 2.0
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "runs.csv"
+        np.savetxt(file, np.concatenate(rows), delimiter=",", fmt="%.6f")
+        log = load_log(file, columns={"time": 0, "position": [1, 2], "velocity": [3, 4], "effort": [5, 6]})
+    found = log_transitions(log, stride=STRIDE)
+    data = found.data[:, [0, 1, 2, 3, 4 + DRIVEN[robot]]]  # without the joint that has no motor, and the time step
+    return Bunch(data=data, target=found.target, groups=np.searchsorted(starts, found.time, side="right"))
+
+
+def system(robot: str, seed: int | None = None, error: float = 0.2) -> System:
+    """Return the robot as a table: with unit masses, or with numbers that are wrong by ``error`` (random signs)."""
+    y, plants, links = (0.0, 1.0, 0.0), Plants(robot), []
+    numbers = ((plants.m1, plants.r1, plants.I1), (plants.m2, plants.r2, plants.I2))
+    signs = np.zeros((2, 3)) if seed is None else np.random.RandomState(seed).choice([-1.0, 1.0], (2, 3))
+    for joint, (m, r, inertia) in enumerate(numbers):
+        about_center = inertia - m * r**2
+        if seed is None:
+            m, r, about_center = 1.0, 0.1, 0.01
+        m, r, about_center = np.array([m, r, about_center]) * (1.0 + error * signs[joint])
+        links.append(
+            Link(
+                f"q{joint + 1}",
+                "revolute",
+                y,
+                mass=m,
+                com=(0.0, 0.0, -r),
+                inertia=(about_center, about_center, 0.0),
+                xyz=(0.0, 0.0, -LENGTHS[0] if joint else 0.0),
+                effort=LIMIT if joint == DRIVEN[robot] else 0.0,
+            )
+        )
+    return System(robot, tuple(links), (GravityTerm((0,), (0, 1)), GravityTerm((0, 1), (0, 1))))
+
+
+def regressor(robot: str, kind: str, seed: int = 0, **options: Any) -> Any:
+    """Return a model of the state after 0.01 s.
+
+    ``kind`` is "IFG" (EVGP with rough physics, masses unknown), "GP" (without physics), "URDF" (EVGP with a rigid-body
+    model that is 20 % off) or "parameters" (the same, whose masses, lengths and inertias are learned).
+    """
+    known = system(robot, seed) if kind in ("URDF", "parameters") else system(robot)
+    options = {"kernel_map": AngleEncoder(known), "n_inducing": 100, "random_state": seed, **options}
+    if kind == "GP":
+        return ResidualRegressor(EVGPRegressor(**options))
+    if kind == "IFG":
+        return EVGPRegressor(InertiaForceGravity(known, dt=DT), **options)
+    unknown = None
+    if kind == "parameters":
+        unknown = {f"mass(q{joint})": LogNormal(1.0, 0.3) for joint in (1, 2)}
+        unknown |= {f"inertia(q{joint})": LogNormal(1.0, 0.5) for joint in (1, 2)} | {"length(q2)": LogNormal(1.0, 0.3)}
+    return EVGPRegressor(
+        make_union(InertiaForce(known, dt=DT), NominalDynamics(known, dt=DT, parameters=unknown)), **options
+    )
+
+
+def learn(robot: str, kind: str, runs: list[Run], seed: int = 0, **options: Any) -> Any:
+    """Fit a model to runs, and compile it."""
+    rows = transitions(robot, runs)
+    return regressor(robot, kind, seed, **options).fit(rows.data, rows.target, groups=rows.groups)
