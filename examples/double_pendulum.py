@@ -261,12 +261,15 @@ def explore(robot: str, seconds: float, seed: int) -> list[Run]:
 
 
 def practise(robot: str, library: Library, seconds: float, seed: int) -> list[Run]:
-    """Record runs of the controller with small random torques: some from hanging, others of a second near its plan."""
+    """Record runs of the controller with small random torques: some from hanging, others of a second near its plan.
+
+    Half of the others start near the goal, where the feedback needs the most accurate derivatives.
+    """
     rng = np.random.RandomState(seed)
-    n_whole = max(round(0.5 * seconds / 2.5), 1)
+    n_whole = max(round(0.3 * seconds / 2.5), 1)
     n = round(seconds - 2.5 * n_whole)
     first = rng.randint(0, library.horizon, n)
-    starts = np.where(rng.uniform(size=(n, 1)) < 0.2, GOAL, library.Z[first])
+    starts = np.where(rng.uniform(size=(n, 1)) < 0.5, GOAL, library.Z[first])
     starts = starts + rng.standard_normal((n, 4)) * [0.1, 0.1, 0.5, 0.5]
     runs = []
     for nodes, states, duration in ((None, np.zeros((n_whole, 4)), 2.5), (first, starts, 1.0)):
