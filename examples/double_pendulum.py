@@ -22,7 +22,7 @@ from sklearn.utils import Bunch
 
 from mpc import Follower, Library, Reach
 from skevgp import EVGPRegressor, ResidualRegressor
-from skevgp.datasets import load_log, log_transitions
+from skevgp.datasets import load_log
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LogNormal, NominalDynamics
 from skevgp.robots.systems import GravityTerm, Link, System
 
@@ -204,8 +204,9 @@ class Truth:
 # Noise of the sensors, rad and rad/s. A run ends at this speed, rad/s, as on the real robot.
 SENSORS = Disturbances(position_noise=1e-3, velocity_noise=0.05)
 FASTEST = 30.0
-# Rows of 500 Hz from a state to the next.
+# Rows of 500 Hz from a state to the next, and the cutoff frequency of the filter of the log, Hz.
 STRIDE = 5
+CUTOFF = 30.0
 DT = STRIDE * STEP
 
 TASK = Reach(
@@ -286,21 +287,29 @@ def practise(robot: str, library: Library, seconds: float, seed: int) -> list[Ru
 
 
 def transitions(robot: str, runs: list[Run]) -> Bunch:
-    """Write the runs to a log, with pauses between them, and read state transitions of 0.01 s from it."""
-    rows, starts, now = [], [], 0.0
+    """Write the runs to a log, with pauses between them, and read state transitions of 0.01 s from it.
+
+    Raw velocities are too noisy for the derivatives that feedback needs. `load_log` filters all signals alike, so that
+    they still obey the same linear dynamics near the goal.
+    """
+    rows, now = [], 0.0
     for states, torques in runs:
-        tau = np.zeros((len(states), 2))
-        tau[:, DRIVEN[robot]] = torques
-        rows.append(np.column_stack([now + STEP * np.arange(len(states)), states, tau]))
-        starts.append(now)
+        rows.append(np.column_stack([now + STEP * np.arange(len(states)), states, torques, np.zeros(len(states))]))
         now += STEP * len(states) + 2.0
     with TemporaryDirectory() as folder:
         file = Path(folder) / "runs.csv"
         np.savetxt(file, np.concatenate(rows), delimiter=",", fmt="%.6f")
-        log = load_log(file, columns={"time": 0, "position": [1, 2], "velocity": [3, 4], "effort": [5, 6]})
-    found = log_transitions(log, stride=STRIDE)
-    data = found.data[:, [0, 1, 2, 3, 4 + DRIVEN[robot]]]  # without the joint that has no motor, and the time step
-    return Bunch(data=data, target=found.target, groups=np.searchsorted(starts, found.time, side="right"))
+        columns = {"time": 0, "position": [1, 2], "velocity": [3, 4], "effort": [5, 6]}
+        log = load_log(file, columns=columns, cutoff=CUTOFF, dt=None, rest_velocity=0.0)
+    X, y, groups = [], [], []
+    for piece in np.unique(log.pieces):
+        own = log.pieces == piece
+        z, u = log.data[own, :4], log.target[own, 0]
+        first = np.arange(0, len(z) - STRIDE, STRIDE)
+        X.append(np.column_stack([z[first], np.mean([u[first + k] for k in range(STRIDE)], axis=0)]))
+        y.append(z[first + STRIDE])
+        groups.append(np.full(len(first), piece))
+    return Bunch(data=np.vstack(X), target=np.vstack(y), groups=np.concatenate(groups))
 
 
 def system(robot: str, seed: int | None = None, error: float = 0.2) -> System:

@@ -358,7 +358,7 @@ def plan_many(model: Any, task: Reach, starts: np.ndarray, U: np.ndarray, n_iter
     goal = encoder.transform(np.array([task.goal]))[0]
     weights = np.tile(task.weights[:-1], (horizon + 1, 1))
     weights[-1], by_input = task.last_weights, task.weights[-1] ** 2
-    steps, every = 0.6 ** np.arange(7), np.arange(n)
+    steps, every = 0.5 ** np.arange(5), np.arange(n)
 
     def residuals(Z: np.ndarray) -> np.ndarray:
         return weights * (encoder.transform(Z.reshape(-1, d)).reshape(*Z.shape[:-1], -1) - goal)
@@ -425,24 +425,47 @@ def waves(n: int, horizon: int, dt: float, size: float, rng: np.random.RandomSta
     return size * rng.uniform(0.2, 1.0, (n, 1)) * np.sin(2.0 * np.pi * t / periods + phases)
 
 
-def riccati(F: np.ndarray, task: Reach, P: np.ndarray, at_goal: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def riccati(
+    F: np.ndarray, task: Reach, P: np.ndarray, at_goal: bool = False, spread: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return gains (T, n_states) and costs to go (T + 1, n_states, n_states) along Jacobians (T, n_states, n_states + 1).
 
-    The input changes by gain @ (state - planned state).
+    The input changes by gain @ (state - planned state). ``spread`` (n_samples, n_states, n_states + 1) has deviations of
+    sampled Jacobians from their mean. The gain then minimises the expected cost of Jacobians that are drawn in each step.
+    It acts more strongly against a fall that an uncertain Jacobian may hide.
     """
-    states, inputs = (
-        (task.top_state_cost, task.top_input_cost) if at_goal else (task.state_cost, task.input_cost)
-    )
-    Q, R, d = task.dt * np.diag(states), task.dt * inputs, len(P)
+    states, inputs = (task.top_state_cost, task.top_input_cost) if at_goal else (task.state_cost, task.input_cost)
+    d = len(P)
+    now = task.dt * np.diag([*states, inputs])
     gains, costs = np.empty((len(F), d)), np.empty((len(F) + 1, d, d))
     costs[-1] = P
+    if spread is not None:  # E[D' P D] is linear in P
+        doubt = np.einsum("sia,sjb->abij", spread, spread).reshape((d + 1) ** 2, d * d) / len(spread)
     for t in reversed(range(len(F))):
-        A, B = F[t, :, :d], F[t, :, d]
-        by = costs[t + 1] @ B
-        gains[t] = -(by @ A) / (R + B @ by)
-        P = Q + A.T @ costs[t + 1] @ A + np.outer(by @ A, gains[t])
+        H = now + F[t].T @ costs[t + 1] @ F[t]
+        if spread is not None:
+            H += (doubt @ costs[t + 1].ravel()).reshape(d + 1, d + 1)
+        gains[t] = -H[d, :d] / H[d, d]
+        P = H[:d, :d] + np.outer(H[:d, d], gains[t])
         costs[t] = 0.5 * (P + P.T)
     return gains, costs
+
+
+def sampled_slopes(regressor: Any, row: np.ndarray, n_samples: int = 100, step: float = 1e-3) -> np.ndarray:
+    """Return deviations (n_samples, n_outputs, n_columns) of Jacobians of sampled functions from their mean, at a row."""
+    moves = step * np.eye(len(row))
+    values = regressor.sample_functions(n_samples, random_state=0)(np.concatenate([row + moves, row - moves]))
+    slopes = (values[:, : len(row)] - values[:, len(row) :]) / (2.0 * step)
+    return np.swapaxes(slopes - slopes.mean(axis=0), 1, 2)
+
+
+def _at_rest(F: np.ndarray, task: Reach, spread: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gain and the cost to go at the goal. No gain is safe for a very wide spread, which is then halved."""
+    while True:
+        gains, costs = riccati(np.repeat(F, _LONG, axis=0), task, np.diag(task.top_state_cost), True, spread)
+        if spread is None or costs[0].max() < 1.01 * costs[_LONG // 10].max():
+            return gains[0], costs[0]
+        spread = 0.5 * spread
 
 
 class Library:
@@ -455,14 +478,15 @@ class Library:
     Z : ndarray of shape (n_plans, horizon + 1, n_states)
         The first plan is that from rest.
     U : ndarray of shape (n_plans, horizon)
+    spread : ndarray of shape (n_samples, n_states, n_states + 1), default=None
+        Deviations of sampled Jacobians at the goal, as returned by `sampled_slopes`. If None, the model is certain.
     """
 
-    def __init__(self, model: Any, task: Reach, Z: np.ndarray, U: np.ndarray):
+    def __init__(self, model: Any, task: Reach, Z: np.ndarray, U: np.ndarray, spread: np.ndarray | None = None):
         self.task, d = task, Z.shape[2]
         self.goal = np.array(task.goal)
         F = model.value_and_jacobian(np.append(self.goal, 0.0)[np.newaxis])[1]
-        top = riccati(np.repeat(F, _LONG, axis=0), task, np.diag(task.top_state_cost), at_goal=True)
-        self.top_gain, self.top_cost = top[0][0], top[1][0]
+        self.top_gain, self.top_cost = _at_rest(F, task, spread)
         # Within this cost to go, the feedback at the goal is within the limit of the input.
         self.near = task.limit**2 / (self.top_gain @ np.linalg.solve(self.top_cost, self.top_gain))
         self.top_slopes = self._of_velocities(F)[0]
