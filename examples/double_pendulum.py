@@ -1,6 +1,6 @@
 """The double pendulum of RealAIGym in simulation: acrobot and pendubot, many plants at once.
 
-`plot_double_pendulum.py` and `benchmarks/realaigym.py` use this module. The numbers of the robot and of its disturbances
+`plot_acrobot.py` and `benchmarks/realaigym.py` use this module. The numbers of the robot and of its disturbances
 are those of the public repository dfki-ric-underactuated-lab/double_pendulum. Angles are 0 where the arm hangs, and the
 second one is relative to the first.
 """
@@ -8,7 +8,8 @@ second one is relative to the first.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +21,7 @@ import numpy as np
 from sklearn.pipeline import make_union
 from sklearn.utils import Bunch
 
-from mpc import Follower, Library, Reach
+from mpc import Follower, Library, Reach, plan_many, sampled_slopes, waves
 from skevgp import EVGPRegressor, ResidualRegressor
 from skevgp.datasets import load_log
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LogNormal, NominalDynamics
@@ -199,7 +200,7 @@ class Truth:
         return self.predict(X), np.stack(slopes, axis=-1)
 
 
-# --- data and models ---------------------------------------------------------------------------------------------------
+# --- data and models -------------------------------------------------------------------------------------------------
 
 # Noise of the sensors, rad and rad/s. A run ends at this speed, rad/s, as on the real robot.
 SENSORS = Disturbances(position_noise=1e-3, velocity_noise=0.05)
@@ -358,7 +359,58 @@ def regressor(robot: str, kind: str, seed: int = 0, **options: Any) -> Any:
     )
 
 
-def learn(robot: str, kind: str, runs: list[Run], seed: int = 0, **options: Any) -> Any:
-    """Fit a model to runs, and compile it."""
-    rows = transitions(robot, runs)
-    return regressor(robot, kind, seed, **options).fit(rows.data, rows.target, groups=rows.groups)
+# --- from ignorance to a controller ----------------------------------------------------------------------------------
+
+# Number of steps of a plan, number of first inputs from which plans start, and number of plans of a controller.
+HORIZON, N_STARTS, N_PLANS = 200, 12, 3
+# Seconds of data after which the robot learns a model and makes new plans. The first ones are recorded in ignorance.
+STAGES = 10.0, 20.0, 40.0, 60.0, 120.0, 180.0
+
+
+def plan_swing_ups(model: Any, rng: np.random.RandomState, known: np.ndarray | None = None, n_iter: int = 50) -> Bunch:
+    """Plan from hanging, from random inputs and from those of known plans (n_plans, HORIZON)."""
+    U = waves(N_STARTS, HORIZON, DT, 0.5 * LIMIT, rng)
+    if known is not None:
+        U = np.concatenate([known, U[: N_STARTS - 2 * len(known)]])
+    return plan_many(model, TASK, np.zeros((len(U), 4)), U, n_iter)
+
+
+def controller_of(model: Any, plans: Bunch, regressor: Any = None) -> Library:
+    """Return the best plans with feedback. With the regressor, the feedback at the goal is cautious."""
+    spread = None if regressor is None else sampled_slopes(regressor, np.append(GOAL, 0.0))
+    return Library(model, TASK, plans.Z[:N_PLANS], plans.U[:N_PLANS], spread)
+
+
+def study(
+    robot: str, kind: str, seed: int = 0, stages: Sequence[float] = STAGES, n_inducing: int = 250
+) -> Iterator[Bunch]:
+    """Learn, plan and practise, stage by stage.
+
+    Yields
+    ------
+    stage : Bunch
+        ``seconds`` of data, ``rows`` of `transitions`, ``regressor``, ``model`` (compiled), ``plans``, ``library`` and
+        ``fit_seconds``, processor time.
+    """
+    rng, runs, library, known, recorded = np.random.RandomState(seed), list[Run](), None, None, 0.0
+    for number, seconds in enumerate(stages):
+        if library is None:
+            runs += explore(robot, seconds, seed)
+        else:
+            runs += practise(robot, library, seconds - recorded, 1000 * seed + number)
+        recorded = seconds
+        rows, start = transitions(robot, runs), time.process_time()
+        fitted = regressor(robot, kind, seed, n_inducing=n_inducing).fit(rows.data, rows.target, groups=rows.groups)
+        fit_seconds = time.process_time() - start
+        model = fitted.compile(include_noise=False)
+        plans = plan_swing_ups(model, rng, known)
+        library, known = controller_of(model, plans, fitted), plans.U[:4]
+        yield Bunch(
+            seconds=seconds,
+            rows=rows,
+            regressor=fitted,
+            model=model,
+            plans=plans,
+            library=library,
+            fit_seconds=fit_seconds,
+        )

@@ -428,11 +428,11 @@ def waves(n: int, horizon: int, dt: float, size: float, rng: np.random.RandomSta
 def riccati(
     F: np.ndarray, task: Reach, P: np.ndarray, at_goal: bool = False, spread: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains (T, n_states) and costs to go (T + 1, n_states, n_states) along Jacobians (T, n_states, n_states + 1).
+    """Return gains (T, n_states) and costs to go (T + 1, n_states, n_states) along Jacobians F.
 
-    The input changes by gain @ (state - planned state). ``spread`` (n_samples, n_states, n_states + 1) has deviations of
-    sampled Jacobians from their mean. The gain then minimises the expected cost of Jacobians that are drawn in each step.
-    It acts more strongly against a fall that an uncertain Jacobian may hide.
+    F has the shape (T, n_states, n_states + 1). The input changes by gain @ (state - planned state). ``spread``
+    (n_samples, n_states, n_states + 1) has deviations of sampled Jacobians from their mean. The gain then minimises the
+    expected cost if each step has another sample. It acts more strongly against a fall that the mean may hide.
     """
     states, inputs = (task.top_state_cost, task.top_input_cost) if at_goal else (task.state_cost, task.input_cost)
     d = len(P)
@@ -452,7 +452,7 @@ def riccati(
 
 
 def sampled_slopes(regressor: Any, row: np.ndarray, n_samples: int = 100, step: float = 1e-3) -> np.ndarray:
-    """Return deviations (n_samples, n_outputs, n_columns) of Jacobians of sampled functions from their mean, at a row."""
+    """Return Jacobians (n_samples, n_outputs, n_columns) of sampled functions at a row, without their mean."""
     moves = step * np.eye(len(row))
     values = regressor.sample_functions(n_samples, random_state=0)(np.concatenate([row + moves, row - moves]))
     slopes = (values[:, : len(row)] - values[:, len(row) :]) / (2.0 * step)
