@@ -6,8 +6,8 @@
     python benchmarks/realaigym.py --quick                          # the pendubot, 20 s of data: a quarter of a minute
 
 The simulated double pendulum has one motor, at the elbow (acrobot) or at the shoulder (pendubot). It hangs at rest.
-After 10 s it must be upright: each angle within 0.35 rad and each velocity within 1 rad/s. Robot, disturbances and score
-are those of the leaderboards of RealAIGym (V2, simulation; dfki-ric-underactuated-lab/double_pendulum).
+After 10 s it must be upright: each angle within 0.35 rad and each velocity within 1 rad/s. Robot, disturbances and
+score are those of the leaderboards of RealAIGym (V2, simulation; dfki-ric-underactuated-lab/double_pendulum).
 
 A run of the benchmark learns as in examples/double_pendulum.py. The first 10 s of data are random torques. Each
 following stage is recorded with the controller that was learned from all earlier data. The controller has plans by

@@ -350,13 +350,13 @@ def regressor(robot: str, kind: str, seed: int = 0, **options: Any) -> Any:
         return ResidualRegressor(EVGPRegressor(**options))
     if kind == "IFG":
         return EVGPRegressor(InertiaForceGravity(known, dt=DT), **options)
-    unknown = None
-    if kind == "parameters":
-        unknown = {f"mass(q{joint})": LogNormal(1.0, 0.3) for joint in (1, 2)}
-        unknown |= {f"inertia(q{joint})": LogNormal(1.0, 0.5) for joint in (1, 2)} | {"length(q2)": LogNormal(1.0, 0.3)}
-    return EVGPRegressor(
-        make_union(InertiaForce(known, dt=DT), NominalDynamics(known, dt=DT, parameters=unknown)), **options
-    )
+    if kind == "URDF":
+        nominal = NominalDynamics(known, terms=["midpoint"], dt=DT)
+    else:
+        links = {f"{number}(q{joint})": LogNormal(1.0, 0.3) for number in ("mass", "inertia") for joint in (1, 2)}
+        parameters = links | {"length(q2)": LogNormal(1.0, 0.3)}
+        nominal = NominalDynamics(known, terms=["midpoint"], dt=DT, parameters=parameters, model_error=0.03)
+    return EVGPRegressor(make_union(InertiaForce(known, dt=DT), nominal), **options)
 
 
 # --- from ignorance to a controller ----------------------------------------------------------------------------------
