@@ -300,40 +300,41 @@ class NominalDynamics(ParametricMap, RobotMap):
         return self._moved
 
     def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
-        n = self._layout.n_joints
+        # Joint forces are polynomials of degree 2 in each factor, so that central differences of them are exact for any
+        # step. For given forces, M(q) dq̈/dθ is minus the derivative of the forces that q̈ needs.
+        n, terms = self._layout.n_joints, self._terms
         q, v, u = X[:, :n], X[:, n : 2 * n], X[:, 2 * n :]
-        columns = [
-            np.hstack([self._by_parameter(term, bodies, q, v, u) for term in self._terms])
-            for bodies in self._bodies_around()
-        ]
+        body, still = self._body, np.zeros_like(v)
+        if "acceleration" in terms or "midpoint" in terms:
+            a = body.accelerations_under(q, v, u)
+        if "midpoint" in terms:
+            middle = self._middle(q, v, u)
+            a_middle = body.accelerations_under(*middle)
+            by_v = self._half_step() * body.accelerations_under_jacobian(*middle)[:, :, n : 2 * n]
+        if "input" in terms:
+            a_input = body.accelerations_by_force(q, body.joint_forces(u))
+        columns = []
+        for more, less, width in self._bodies_around():
+            found = {}
+            if "acceleration" in terms or "midpoint" in terms:
+                change = more.forces_under_damping(q, v, a) - less.forces_under_damping(q, v, a)
+                found["acceleration"] = -body.accelerations_by_force(q, change)
+            if "midpoint" in terms:
+                at = (*middle[:2], a_middle)
+                change = more.forces_under_damping(*at) - less.forces_under_damping(*at)
+                before = (by_v @ found["acceleration"][:, :, np.newaxis])[:, :, 0]
+                found["midpoint"] = before - body.accelerations_by_force(middle[0], change)
+            if "gravity" in terms:
+                found["gravity"] = more.gravity(q) - less.gravity(q)
+            if "bias" in terms:
+                found["bias"] = more.forces(q, v, still) - less.forces(q, v, still)
+            if "input" in terms:
+                change = more.inertial_forces(q, a_input) - less.inertial_forces(q, a_input)
+                found["input"] = -body.accelerations_by_force(q, change)
+            columns.append(np.hstack([found[term] for term in terms]) / width)
         jacobian = np.stack(columns, axis=-1)
         self._check_finite(jacobian, q)
         return jacobian
-
-    def _by_parameter(
-        self, term: str, bodies: tuple[RigidBody, RigidBody, float], q: np.ndarray, v: np.ndarray, u: np.ndarray
-    ) -> np.ndarray:
-        """Return the derivative of a term with respect to the parameter that two bodies differ in."""
-        # Joint forces are polynomials of degree 2 in each factor, so that central differences of them are exact for any
-        # step. For given forces, M(q) dq̈/dθ is minus the derivative of the forces that q̈ needs.
-        (more, less, width), body, still = bodies, self._body, np.zeros_like(v)
-        if term == "gravity":
-            return (more.gravity(q) - less.gravity(q)) / width
-        if term == "bias":
-            return (more.forces(q, v, still) - less.forces(q, v, still)) / width
-        if term == "midpoint":
-            middle = self._middle(q, v, u)
-            by_v = body.accelerations_under_jacobian(*middle)[:, :, v.shape[1] : 2 * v.shape[1]]
-            before = self._by_parameter("acceleration", bodies, q, v, u)
-            after = self._by_parameter("acceleration", bodies, *middle)
-            return after + self._half_step() * (by_v @ before[:, :, np.newaxis])[:, :, 0]
-        if term == "input":
-            a = body.accelerations_by_force(q, body.joint_forces(u))
-            change = more.inertial_forces(q, a) - less.inertial_forces(q, a)
-        else:
-            a = body.accelerations_under(q, v, u)
-            change = more.forces_under_damping(q, v, a) - less.forces_under_damping(q, v, a)
-        return -body.accelerations_by_force(q, change / width)
 
     def _check_finite(self, values: np.ndarray, q: np.ndarray) -> None:
         if not np.isfinite(values).all():
