@@ -44,6 +44,7 @@ PAGES = {
     "auto_inducing": ("tables", lambda own, rows: own.tables_of_inducing(rows)),
     "rollouts": ("control", lambda own, rows: own.rollout_tables(rows)),
     "swing_up": ("control", lambda own, rows: own.swing_up_tables(rows)),
+    "realaigym": ("realaigym", lambda own, rows: own.tables(rows)),
     "tracking": ("control", lambda own, rows: own.tracking_tables(rows)),
     "identification": ("robots", lambda own, rows: own.identification_tables(rows)),
     "physics": ("physics", lambda own, rows: own.tables_of_errors(rows)),
