@@ -1,7 +1,7 @@
 """Acrobot and pendubot of RealAIGym: robustness of controllers that learn from seconds of data.
 
     python benchmarks/realaigym.py                                  # hours of one core
-    python benchmarks/realaigym.py --models IFG --seeds 1           # three minutes
+    python benchmarks/realaigym.py --models IFG --seeds 1           # five minutes
     python benchmarks/realaigym.py --robots acrobot --models URDF
     python benchmarks/realaigym.py --quick                          # the pendubot, 20 s of data: a quarter of a minute
 
@@ -23,7 +23,7 @@ states, never the true robot. The models are:
 - TVLQR: feedback of the leaderboard's controller of this name, along one plan on the true robot. It checks the
   simulator.
 
-Columns of the CSV: ``seconds`` of data; six shares, whose mean is ``score``; ``swings_up``, the success without
+Columns of the CSV: ``seconds`` of data, 0 for the true model; six shares, whose mean is ``score``; ``swings_up``, the success without
 disturbances; ``both``, the share of pulses on both joints, which is not in the score; ``step_ms``, processor time of a
 control step of 2 ms; ``fit_seconds``, processor time of the last fit.
 
@@ -39,7 +39,6 @@ import itertools
 import sys
 import time
 from collections import namedtuple
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -79,6 +78,9 @@ MODELS = {
     "truth": "the true model",
     "TVLQR": "TVLQR on the true model",
 }
+TRUE = "truth", "TVLQR"
+# Physics leaves less to the kernel.
+N_INDUCING = {"IFG": 250, "GP": 250, "URDF": 100, "parameters": 100}
 # Scores of the leaderboards.
 PUBLISHED = {
     "MC-PILCO": (0.241, 0.614),
@@ -90,8 +92,8 @@ SECONDS = 20.0, 60.0, 180.0
 SHARES = ("model", "velocity noise", "torque noise", "torque response", "delay", "pulses")
 LEVELS, REPETITIONS, PULSES = 21, 10, 50
 
-# All seconds of data of one robot, or one run on the true model.
-Cell = namedtuple("Cell", "robot kind seed size")
+# One controller, learned from so many seconds of data. The true model has none.
+Cell = namedtuple("Cell", "robot kind seed seconds size")
 
 
 # --- disturbances ----------------------------------------------------------------------------------------------------
@@ -191,34 +193,26 @@ def step_ms(library: Library, n_calls: int = 1000) -> float:
     return 1e3 * (time.process_time() - start) / n_calls
 
 
-def controllers(cell: Cell) -> Iterator[tuple[float, float, Library]]:
-    """Yield seconds of data, seconds of the last fit, and plans with feedback."""
-    if cell.kind in ("truth", "TVLQR"):
+def controller(cell: Cell) -> tuple[Library, float]:
+    """Return plans with feedback, and processor seconds of the last fit."""
+    if cell.kind in TRUE:
         model = Truth(Plants(cell.robot))
-        yield 0.0, 0.0, controller_of(model, plan_swing_ups(model, np.random.RandomState(cell.seed)))
-        return
-    quick = cell.size == "quick"
-    for stage in study(
-        cell.robot, cell.kind, cell.seed, STAGES[:2] if quick else STAGES, 40 if quick else N_INDUCING[cell.kind]
-    ):
-        if stage.seconds in SECONDS:
-            yield stage.seconds, stage.fit_seconds, stage.library
+        return controller_of(model, plan_swing_ups(model, np.random.RandomState(cell.seed))), 0.0
+    stages = [seconds for seconds in STAGES if seconds <= cell.seconds]
+    n_inducing = 40 if cell.size == "quick" else N_INDUCING[cell.kind]
+    *_, last = study(cell.robot, cell.kind, cell.seed, stages, n_inducing)
+    return last.library, last.fit_seconds
 
 
-# Physics leaves less to the kernel.
-N_INDUCING = {"IFG": 250, "GP": 250, "URDF": 100, "parameters": 100}
-
-
-def run(cell: Cell) -> list[dict[str, Any]]:
-    """Learn, and run all trials after each amount of data."""
-    own, rows = trials(cell.robot, cell.size), []
+def run(cell: Cell) -> dict[str, Any]:
+    """Learn, and run all trials."""
+    own = trials(cell.robot, cell.size)
+    n = len(own.share)
     with harness.one_thread():
-        for seconds, fit_seconds, library in controllers(cell):
-            n = len(own.share)
-            follower = LeaderboardTVLQR(library, n) if cell.kind == "TVLQR" else Follower(library, n, STEP)
-            found = scores(own, follower)
-            rows.append({"seconds": seconds, **found, "step_ms": step_ms(library), "fit_seconds": fit_seconds})
-    return rows
+        library, fit_seconds = controller(cell)
+        follower = LeaderboardTVLQR(library, n) if cell.kind == "TVLQR" else Follower(library, n, STEP)
+        found = scores(own, follower)
+        return {**found, "step_ms": step_ms(library), "fit_seconds": fit_seconds}
 
 
 def tables(rows: pd.DataFrame) -> harness.Tables:
@@ -251,12 +245,16 @@ def main() -> None:
     parser = harness.argument_parser(__doc__, quick="the pendubot, 20 s of data, few trials", seeds=5)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), help="default: both")
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
+    parser.add_argument("--seconds", nargs="+", type=float, choices=SECONDS, default=SECONDS, help="default: all")
     options = harness.parse(parser)
-    robots, models = (["pendubot"], ["IFG", "truth"]) if options.quick else (options.robots, options.models)
+    robots, models, durations = options.robots, options.models, options.seconds
+    if options.quick:
+        robots, models, durations = ["pendubot"], ["IFG", "truth"], SECONDS[:1]
     # Seed by seed, so that the page is complete after each seed.
     cells = [
-        Cell(robot, model, seed, options.size)
-        for seed, model, robot in itertools.product(options.seeds, models, robots)
+        Cell(robot, kind, seed, seconds, options.size)
+        for seed, kind, robot in itertools.product(options.seeds, models, robots)
+        for seconds in ([0.0] if kind in TRUE else durations)
     ]
     output = harness.output_path(options, "realaigym")
     n_failures = harness.run_missing(cells, run, output, options.jobs)
