@@ -23,9 +23,9 @@ states, never the true robot. The models are:
 - TVLQR: feedback of the leaderboard's controller of this name, along one plan on the true robot. It checks the
   simulator.
 
-Columns of the CSV: ``seconds`` of data, 0 for the true model; six shares, whose mean is ``score``; ``swings_up``, the success without
-disturbances; ``both``, the share of pulses on both joints, which is not in the score; ``step_ms``, processor time of a
-control step of 2 ms; ``fit_seconds``, processor time of the last fit.
+Columns of the CSV: ``seconds`` of data, 0 for the true model; six shares, whose mean is ``score``; ``swings_up``, the
+success without disturbances; ``both``, the share of pulses on both joints, which is not in the score; ``step_ms``,
+processor time of a control step of 2 ms; ``fit_seconds``, processor time of the last fit.
 
 A share is that of successful runs with a changed model (210 runs), torque response, delay (21 runs each) and pulses of
 torque (50 runs). With noise on velocities and torques, it is the share of 21 noise levels at which more than half of
