@@ -1,6 +1,7 @@
-"""Model predictive control on a learned model: iLQR with a limit on the input, and a new plan at each step.
+"""Control on a learned model: iLQR with a limit on the input, and a new plan at each step or feedback along plans.
 
-`plot_swing_up.py` and `benchmarks/control.py` use this module.
+`plot_swing_up.py` and `benchmarks/control.py` plan at each step (`Planner`). `plot_acrobot.py` and
+`benchmarks/realaigym.py` plan before the run, and follow the plans (`plan_many`, `Library`, `Follower`).
 """
 
 from __future__ import annotations
@@ -498,7 +499,7 @@ class Library:
         self.ahead = Z[:, 1:].reshape(-1, d)
         self.accelerations = (self.ahead - self.Z)[:, d // 2 :] / task.dt
         self.slopes = self._of_velocities(F)
-        self.horizon, self.n_plans = horizon, n
+        self.horizon = horizon
 
     def _of_velocities(self, F: np.ndarray) -> np.ndarray:
         """Return derivatives of accelerations (n, n_joints, n_states + 1) by the Jacobians of the next state."""
@@ -533,10 +534,6 @@ class Follower:
         Number of plants.
     step : float
         Time between calls, s.
-    filtered : bool, default=True
-        Whether to filter states and to predict over delays. If False, measured states are used.
-    replan : bool, default=True
-        Whether to look for another node. If False, the first plan is followed to its end.
     nodes : ndarray of int of shape (n,), default=None
         Node of each plant at the start. If None, the first one of the first plan.
     noise : tuple of float, default=(5e-4, 0.5)
@@ -553,19 +550,15 @@ class Follower:
         n: int,
         step: float,
         *,
-        filtered: bool = True,
-        replan: bool = True,
         nodes: np.ndarray | None = None,
         noise: tuple[float, float] = (5e-4, 0.5),
         unknown: float = 60.0,
         lost: tuple[float, float] = (10.0, 16.0),
     ):
         self.library, self.n, self.step = library, n, step
-        self.filtered, self.replan = filtered, replan
         self.node = np.zeros(n, dtype=int) if nodes is None else nodes.copy()
         self.at_goal, self.since = np.zeros(n, dtype=bool), np.zeros(n, dtype=int)
         self.lost = lost[0] * library.near, lost[1] * library.near
-        self.n_switches = np.zeros(n, dtype=int)
         self._per_node, self._count = round(library.task.dt / step), 0
         self._inputs = np.zeros((_LATEST + 3, n))  # the last ones, newest first
         self._gain = kalman_gain(noise, unknown, step)
@@ -641,8 +634,6 @@ class Follower:
         self.at_goal |= at_end
         self.node = np.where(self.at_goal, self.node, self.node + 1)
         self.since += 1
-        if not self.replan:
-            return
         away = own.task.difference(z, own.Z[self.node])
         cost = np.einsum("ni,nij,nj->n", away, own.cost[self.node], away, optimize=True)
         cost = np.where(self.at_goal, cost_at_goal, cost)
@@ -655,12 +646,11 @@ class Follower:
         better = costs < 0.5 * cost[far]
         far = far[better]
         self.node[far], self.at_goal[far] = nodes[better], False
-        self.n_switches[far] += 1
 
     def __call__(self, count: int, measured: np.ndarray) -> np.ndarray:
         """Return inputs (n,) for measured states (n, n_states)."""
         own, self._count = self.library, count
-        z = self._estimate(measured) if self.filtered else measured
+        z = self._estimate(measured)
         away = own.task.difference(z, own.goal)
         cost = np.einsum("ni,ni->n", away @ own.top_cost, away)
         if count and count % self._per_node == 0:
@@ -670,7 +660,7 @@ class Follower:
         planned = own.Z[self.node] + share * (own.ahead - own.Z)[self.node]
         u = own.U[self.node] + (own.task.difference(z, planned) * own.gain[self.node]).sum(axis=1)
         u = np.where(self.at_goal, away @ own.top_gain, u)
-        if self.filtered and not self._answered.all():  # feedback on a state that may be late would disturb the answer
+        if not self._answered.all():  # feedback on a state that may be late would disturb the answer
             u = np.where(self._answered, u, own.U[self.node])
         u = np.clip(u, -own.task.limit, own.task.limit)
         self._inputs = np.roll(self._inputs, 1, axis=0)
