@@ -73,7 +73,7 @@ try:
             flush=True,
         )
 except ImportError as error:
-    sys.exit(f"error: {error}\nThis example needs Pinocchio and matplotlib: pip install pin matplotlib")
+    sys.exit(f"error: {error}\nThis example needs matplotlib, and Pinocchio for a URDF: pip install matplotlib pin")
 
 # %%
 # Plot the last try

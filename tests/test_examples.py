@@ -121,7 +121,6 @@ def test_missing_package_names_pip_command(package, pip):
         "plot_any_robot.py",
         "plot_rollout.py",
         "plot_swing_up.py",
-        "plot_acrobot.py",
         "plot_crocoddyl.py",
         "plot_tracking.py",
         "plot_online.py",
