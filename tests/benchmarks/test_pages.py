@@ -267,8 +267,13 @@ SAID = [
     ),
     (
         "docs/guide/realaigym",
-        "| URDF 20 % off, parameters learned | 20 s | {} and {} | {} | {} |",
+        "| URDF 20 % off, parameters learned | 20 s | {} | {} | {} |",
         lambda: on_realaigym("parameters", 20),
+    ),
+    (
+        "docs/guide/realaigym",
+        "| URDF 20 % off, parameters learned | 60 s | {} | {} | |",
+        lambda: on_realaigym("parameters", 60),
     ),
     ("docs/guide/realaigym", "| URDF 20 % off | 20 s | {} | {} | {} |", lambda: on_realaigym("URDF", 20)),
     ("docs/guide/realaigym", "| URDF 20 % off | 60 s | {} | {} | |", lambda: on_realaigym("URDF", 60)),
