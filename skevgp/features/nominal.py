@@ -209,7 +209,7 @@ class NominalDynamics(ParametricMap, RobotMap):
 
     def _half_step(self) -> float:
         assert not isinstance(self.dt, str)  # as _check_terms has found
-        return 0.5 * self.dt
+        return 0.5 * (self.dt or 0.0)
 
     def _middle(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the state in the middle of the time step, by Euler's rule, and the input."""
