@@ -41,6 +41,7 @@ EXAMPLE_RUNS = [
     ("any_robot", [], "constant velocity"),
     ("rollout", [], "share of the true states within 2 std"),
     ("swing_up", ["--system", "cartpole"], "EVGP-IFG"),
+    ("acrobot", ["--robot", "pendubot"], "predicted std"),
     ("crocoddyl", ["--system", "pendulum"], "particles are"),
     ("real_arm", [], "coulomb(wrist_3_joint)"),
     ("payload", [], "online, forgetting factor 0.8"),

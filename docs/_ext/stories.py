@@ -17,7 +17,7 @@ DOCS = Path(__file__).resolve().parents[1]
 GROUPS = {
     "Tables of numbers": ["sparse_gp", "tabular", "many_rows"],
     "Dynamics of robots": ["learn_dynamics", "any_robot", "nominal_dynamics", "link_gravity", "calibrate_simulator"],
-    "Prediction and control": ["rollout", "online", "swing_up", "crocoddyl"],
+    "Prediction and control": ["rollout", "online", "swing_up", "acrobot", "crocoddyl"],
     "Real arms": ["real_arm", "payload", "tracking"],
 }
 OTHERS = "More examples"  # of no group

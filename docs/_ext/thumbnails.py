@@ -59,6 +59,7 @@ PANELS = {
     "rollout": Panel(1, "time", "angle"),
     "online": Panel(0, "time", "error"),
     "swing_up": Panel(1, "time", "angle"),
+    "acrobot": Panel(1, "time", "angle"),
     "crocoddyl": Panel(0, "time", "angle"),
     "real_arm": Panel(0, "time", "torque"),
     "payload": Panel(0, "length of the log", "mass"),

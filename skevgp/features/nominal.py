@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
@@ -17,6 +17,7 @@ from .theta import Prior
 
 _NAMES = {
     "acceleration": "acc({})",
+    "midpoint": "acc in mid-step({})",
     "gravity": "gravity torque({})",
     "bias": "bias torque({})",
     "input": "acc by u({})",
@@ -46,6 +47,8 @@ class NominalDynamics(ParametricMap, RobotMap):
         Groups of columns, with one column for each joint:
 
         - ``"acceleration"``: :math:`\ddot q`, rad/s² or m/s²
+        - ``"midpoint"``: :math:`\ddot q` in the middle of the time step, by the midpoint rule. Use it for long steps or
+          fast motions. It needs a number as ``dt``
         - ``"gravity"``: :math:`g(q)`, N m or N
         - ``"bias"``: :math:`C \dot q + g`, N m or N
         - ``"input"``: :math:`M^{-1} B u`, the acceleration by the input
@@ -89,8 +92,9 @@ class NominalDynamics(ParametricMap, RobotMap):
 
     Notes
     -----
-    The weights of ``"input"`` have mean 0 if ``terms`` has ``"acceleration"``, and otherwise Δt. Do not scale the
-    columns of X before this map. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
+    Weights have mean Δt for one term: ``"midpoint"``, or else ``"acceleration"``, or else ``"input"``. Those of the
+    others have mean 0. Do not scale the columns of X before this map. Scale in the ``kernel_map`` of the regressor,
+    which only the kernel uses.
 
     Examples
     --------
@@ -164,6 +168,8 @@ class NominalDynamics(ParametricMap, RobotMap):
         terms = [term for term in self.terms if isinstance(term, str) and term in _NAMES]
         if not terms or len(terms) < len(self.terms) or len(set(terms)) < len(terms):
             raise ValueError(f"terms={self.terms!r} must be one or more of {list(_NAMES)}, each once.")
+        if "midpoint" in terms and isinstance(self.dt, str):
+            raise ValueError(f'terms={self.terms!r} with "midpoint" needs a number as dt; got dt={self.dt!r}.')
 
     def _features(self, X: np.ndarray) -> np.ndarray:
         if self.robot is None:
@@ -173,6 +179,7 @@ class NominalDynamics(ParametricMap, RobotMap):
         body = self._body
         columns = {
             "acceleration": lambda: body.accelerations_under(q, v, u),
+            "midpoint": lambda: body.accelerations_under(*self._middle(q, v, u)),
             "gravity": lambda: body.gravity(q),
             "bias": lambda: body.forces(q, v, np.zeros_like(v)),
             "input": lambda: body.accelerations_by_force(q, body.joint_forces(u)),
@@ -189,12 +196,32 @@ class NominalDynamics(ParametricMap, RobotMap):
         body = self._body
         blocks = {
             "acceleration": lambda: body.accelerations_under_jacobian(q, v, u),
+            "midpoint": lambda: self._midpoint_jacobian(q, v, u),
             "gravity": lambda: body.gravity_jacobian(q),
             "bias": lambda: body.forces_jacobian(q, v, np.zeros_like(v)),
             "input": lambda: body.accelerations_by_force_jacobian(q, u),
         }
         jacobian = np.concatenate([blocks[term]() for term in self._terms], axis=1)
         self._check_finite(jacobian, q)
+        return jacobian
+
+    # --- the midpoint rule --------------------------------------------------------------------------------------------
+
+    def _half_step(self) -> float:
+        assert not isinstance(self.dt, str)  # as _check_terms has found
+        return 0.5 * (self.dt or 0.0)
+
+    def _middle(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the state in the middle of the time step, by Euler's rule, and the input."""
+        h = self._half_step()
+        return q + h * v, v + h * self._body.accelerations_under(q, v, u), u
+
+    def _midpoint_jacobian(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        # With x_m = (q + h v, v + h a(x), u): da(x_m)/dx = J(x_m) + h [0, ∂a/∂q(x_m), 0] + h ∂a/∂v(x_m) J(x).
+        n, h = q.shape[1], self._half_step()
+        at_middle = self._body.accelerations_under_jacobian(*self._middle(q, v, u))
+        jacobian = at_middle + h * at_middle[:, :, n : 2 * n] @ self._body.accelerations_under_jacobian(q, v, u)
+        jacobian[:, :, n : 2 * n] += h * at_middle[:, :, :n]
         return jacobian
 
     # --- parameters ---------------------------------------------------------------------------------------------------
@@ -275,31 +302,36 @@ class NominalDynamics(ParametricMap, RobotMap):
     def _theta_derivatives(self, X: np.ndarray) -> np.ndarray:
         # Joint forces are polynomials of degree 2 in each factor, so that central differences of them are exact for any
         # step. For given forces, M(q) dq̈/dθ is minus the derivative of the forces that q̈ needs.
-        n = self._layout.n_joints
+        n, terms = self._layout.n_joints, self._terms
         q, v, u = X[:, :n], X[:, n : 2 * n], X[:, 2 * n :]
         body, still = self._body, np.zeros_like(v)
-        reached: dict[str, np.ndarray] = {}
-        if "acceleration" in self._terms:
-            reached["acceleration"] = body.accelerations_under(q, v, u)
-        if "input" in self._terms:
-            reached["input"] = body.accelerations_by_force(q, body.joint_forces(u))
-        forces: dict[str, Callable[[RigidBody], np.ndarray]] = {
-            "acceleration": lambda moved: moved.forces_under_damping(q, v, reached["acceleration"]),
-            "gravity": lambda moved: moved.gravity(q),
-            "bias": lambda moved: moved.forces(q, v, still),
-            "input": lambda moved: moved.inertial_forces(q, reached["input"]),
-        }
+        if "acceleration" in terms or "midpoint" in terms:
+            a = body.accelerations_under(q, v, u)
+        if "midpoint" in terms:
+            middle = self._middle(q, v, u)
+            a_middle = body.accelerations_under(*middle)
+            by_v = self._half_step() * body.accelerations_under_jacobian(*middle)[:, :, n : 2 * n]
+        if "input" in terms:
+            a_input = body.accelerations_by_force(q, body.joint_forces(u))
         columns = []
         for more, less, width in self._bodies_around():
-            slopes = [(forces[term](more) - forces[term](less)) / width for term in self._terms]
-            columns.append(
-                np.hstack(
-                    [
-                        -body.accelerations_by_force(q, slope) if term in reached else slope
-                        for term, slope in zip(self._terms, slopes, strict=True)
-                    ]
-                )
-            )
+            found = {}
+            if "acceleration" in terms or "midpoint" in terms:
+                change = more.forces_under_damping(q, v, a) - less.forces_under_damping(q, v, a)
+                found["acceleration"] = -body.accelerations_by_force(q, change)
+            if "midpoint" in terms:
+                at = (*middle[:2], a_middle)
+                change = more.forces_under_damping(*at) - less.forces_under_damping(*at)
+                before = (by_v @ found["acceleration"][:, :, np.newaxis])[:, :, 0]
+                found["midpoint"] = before - body.accelerations_by_force(middle[0], change)
+            if "gravity" in terms:
+                found["gravity"] = more.gravity(q) - less.gravity(q)
+            if "bias" in terms:
+                found["bias"] = more.forces(q, v, still) - less.forces(q, v, still)
+            if "input" in terms:
+                change = more.inertial_forces(q, a_input) - less.inertial_forces(q, a_input)
+                found["input"] = -body.accelerations_by_force(q, change)
+            columns.append(np.hstack([found[term] for term in terms]) / width)
         jacobian = np.stack(columns, axis=-1)
         self._check_finite(jacobian, q)
         return jacobian
@@ -325,8 +357,8 @@ class NominalDynamics(ParametricMap, RobotMap):
         return [_NAMES[term].format(name) for term in self._terms for name in columns[: self._layout.n_joints]]
 
     def _is_known(self, term: str) -> bool:
-        """Whether a joint's own column of a term predicts its acceleration."""
-        return term == "acceleration" or (term == "input" and "acceleration" not in self.terms)
+        """Whether a joint's own column of a term predicts its acceleration: that of the first term of these."""
+        return term == next((known for known in ("midpoint", "acceleration", "input") if known in self.terms), None)
 
     def _mean(self, layout: Layout, dt: float) -> np.ndarray:
         self._check_terms()

@@ -169,6 +169,11 @@ class Nominal(_OfRobot):
         force[list(layout.driven)] = row[2 * n :]
         terms = {
             "acceleration": lambda: body.accelerations_under(q, v, force),
+            "midpoint": lambda: body.accelerations_under(
+                q + 0.5 * self.transformer.dt * v,
+                v + 0.5 * self.transformer.dt * body.accelerations_under(q, v, force),
+                force,
+            ),
             "gravity": lambda: body.gravity(q),
             "bias": lambda: body.forces(q, v, None),
             "input": lambda: body.accelerations(q, None, force, gravity=False),

@@ -44,6 +44,7 @@ PAGES = {
     "auto_inducing": ("tables", lambda own, rows: own.tables_of_inducing(rows)),
     "rollouts": ("control", lambda own, rows: own.rollout_tables(rows)),
     "swing_up": ("control", lambda own, rows: own.swing_up_tables(rows)),
+    "realaigym": ("realaigym", lambda own, rows: own.tables(rows)),
     "tracking": ("control", lambda own, rows: own.tracking_tables(rows)),
     "identification": ("robots", lambda own, rows: own.identification_tables(rows)),
     "physics": ("physics", lambda own, rows: own.tables_of_errors(rows)),
@@ -187,6 +188,18 @@ def total(name, column, **where):
     return rows(name, **where)[column].sum()
 
 
+def on_realaigym(kind, seconds):
+    """Number of seeds of each robot, or one if it is the same, and mean scores."""
+    found = rows("realaigym", kind=kind, seconds=seconds).groupby("robot")["score"]
+    return [*dict.fromkeys(found.size()), *found.mean()]
+
+
+def leaderboards_controller(*columns):
+    """Means of the acrobot and of the pendubot."""
+    found = rows("realaigym", kind="TVLQR").groupby("robot")[list(columns)].mean()
+    return [found.loc[robot, column] for column in columns for robot in ("acrobot", "pendubot")]
+
+
 # Words with {} for numbers, and where these are from.
 SAID = [
     ("README", "with | |---|---|---|---|---| | pendulum | {} | {} | {} | {} |", lambda: gains("pendulum")),
@@ -236,6 +249,51 @@ SAID = [
         "docs/benchmarks",
         "break a limit: {} of 322 do",
         lambda: [total("tracking", "value", measure="broken", case="Boole")],
+    ),
+    (
+        "docs/guide/realaigym",
+        "| `InertiaForceGravity`, masses unknown | 20 s | {} | {} | {} |",
+        lambda: on_realaigym("IFG", 20),
+    ),
+    (
+        "docs/guide/realaigym",
+        "| `InertiaForceGravity`, masses unknown | 60 s | {} | {} | {} |",
+        lambda: on_realaigym("IFG", 60),
+    ),
+    (
+        "docs/guide/realaigym",
+        "| `InertiaForceGravity`, masses unknown | 180 s | {} | {} | {} |",
+        lambda: on_realaigym("IFG", 180),
+    ),
+    (
+        "docs/guide/realaigym",
+        "| URDF 20 % off, parameters learned | 20 s | {} | {} | {} |",
+        lambda: on_realaigym("parameters", 20),
+    ),
+    (
+        "docs/guide/realaigym",
+        "| URDF 20 % off, parameters learned | 60 s | {} | {} | |",
+        lambda: on_realaigym("parameters", 60),
+    ),
+    ("docs/guide/realaigym", "| URDF 20 % off | 20 s | {} | {} | {} |", lambda: on_realaigym("URDF", 20)),
+    ("docs/guide/realaigym", "| URDF 20 % off | 60 s | {} | {} | |", lambda: on_realaigym("URDF", 60)),
+    ("docs/guide/realaigym", "| without physics | 20 s | {} | {} | {} |", lambda: on_realaigym("GP", 20)),
+    ("docs/guide/realaigym", "| without physics | 60 s | {} | {} | |", lambda: on_realaigym("GP", 60)),
+    ("docs/guide/realaigym", "| the true model | | {} | {} | {} |", lambda: on_realaigym("truth", 0)),
+    (
+        "docs/benchmarks",
+        "the scores of acrobot and pendubot are {} and {}.",
+        lambda: on_realaigym("IFG", 180)[1:],
+    ),
+    (
+        "docs/guide/realaigym",
+        "scores {} on the acrobot and {} on the pendubot",
+        lambda: leaderboards_controller("score"),
+    ),
+    (
+        "docs/guide/realaigym",
+        "velocities are {} and {}, and",
+        lambda: leaderboards_controller("velocity noise"),
     ),
     ("REPRODUCTION", "{} times the smallest for EVGP-IFG", lambda: [errors("pendulum")["spread"]]),
     ("REPRODUCTION", "{} times on the damped one", lambda: [errors("cartpole_damped")["spread"]]),

@@ -99,6 +99,7 @@ SMOKE = [
     smoke("control", "rollouts --models EVGP-IFG"),
     smoke("control", "swing_up"),
     smoke("control", "tracking"),
+    smoke("realaigym"),
     smoke("physics", "errors"),
     smoke("physics", "wrong"),
     smoke("physics", "curves"),

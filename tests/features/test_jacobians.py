@@ -8,7 +8,7 @@ from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, Lin
 from skevgp.robots import layout_of, load_robot
 from skevgp.robots.systems import Link, System
 
-TERMS = ("acceleration", "gravity", "bias", "input")
+TERMS = ("acceleration", "midpoint", "gravity", "bias", "input")
 PLANAR = ["pendulum", "cartpole", "acrobot"]
 # Turning about skew axes, sliding, and damped.
 LIFT = System(

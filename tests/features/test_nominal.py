@@ -135,6 +135,18 @@ def test_prior_mean_is_what_a_short_step_does():
     assert np.abs(X[:, :4] - after).max() > 1e-4
 
 
+def test_midpoint_predicts_velocities_to_second_order():
+    """Errors are of third order in the time step. Those of Euler's rule are of second order."""
+    X, errors = rows("acrobot"), {}
+    for term in ("acceleration", "midpoint"):
+        for dt in (0.004, 0.002):
+            a = NominalDynamics("acrobot", terms=[term], dt=dt).fit_transform(X)
+            after = simulate("acrobot", X[:, :4], X[:, np.newaxis, 4:], dt)[:, 1]
+            errors[term, dt] = np.abs(X[:, 2:4] + dt * a - after[:, 2:]).max()
+    assert errors["acceleration", 0.004] / errors["acceleration", 0.002] == pytest.approx(4.0, rel=0.1)
+    assert errors["midpoint", 0.004] / errors["midpoint", 0.002] == pytest.approx(8.0, rel=0.1)
+
+
 # For the velocity of each joint: the model's acceleration (m), torques of gravity (g) and bias (b), and others (.).
 @pytest.mark.parametrize(
     ("terms", "groups"),
@@ -144,6 +156,7 @@ def test_prior_mean_is_what_a_short_step_does():
         (["bias"], ["bb", "bb"]),
         (["input"], ["m.", ".m"]),
         (["acceleration", "input"], ["m...", ".m.."]),
+        (["acceleration", "midpoint"], ["..m.", "...m"]),
         (["input", "acceleration"], ["..m.", "...m"]),
         (["input", "gravity", "bias"], ["m.ggbb", ".mggbb"]),
     ],
@@ -190,11 +203,16 @@ def test_features_are_named_after_term_and_joint():
     [["speed"], ["acceleration", "friction"], [], ["gravity", "gravity"], [3], [["bias"]], np.array(["mass"])],
 )
 def test_unknown_terms_list_the_known_ones(terms):
-    message = r"terms=.* must be one or more of \['acceleration', 'gravity', 'bias', 'input'\], each once"
+    message = r"terms=.* must be one or more of \['acceleration', 'midpoint', 'gravity', 'bias', 'input'\], each once"
     with pytest.raises(ValueError, match=message):
         NominalDynamics("acrobot", terms=terms).fit(rows("acrobot"))
     with pytest.raises(ValueError, match=message):
         NominalDynamics("acrobot", terms=terms).coef_prior(4)
+
+
+def test_midpoint_needs_one_time_step():
+    with pytest.raises(ValueError, match="\"midpoint\" needs a number as dt; got dt='column'"):
+        NominalDynamics("acrobot", terms=["midpoint"], dt="column").fit(np.full((2, 6), 0.1))
 
 
 def test_term_alone_is_no_sequence():

@@ -29,7 +29,7 @@ from skevgp.io import load, save
 from skevgp.robots import RigidBody, System, layout_of
 from skevgp.robots.systems import Link
 
-TERMS = ["acceleration", "gravity", "bias", "input"]
+TERMS = ["acceleration", "midpoint", "gravity", "bias", "input"]
 UR5 = {
     "mass(forearm_link)": LogNormal(1.0, 0.2),
     "length(upper_arm_link)": LogNormal(1.0, 0.1),

@@ -45,7 +45,7 @@ from skevgp.maps.theta import LinearizedFeatures, Theta, theta_jacobian
 
 from ..theta import DECAY, PRIORS, WAVE, rows_of_outputs, wave_and_slope
 
-TERMS = ["acceleration", "gravity", "bias", "input"]
+TERMS = ["acceleration", "midpoint", "gravity", "bias", "input"]
 MASK = np.array([False, True, False, False, True])
 
 

@@ -236,16 +236,16 @@ def _transitions(recording: Bunch, stride: int, lags: np.ndarray, align: bool) -
         )
         states = np.hstack([positions, speeds])
         dt = np.diff(time[rows])[:, np.newaxis]
-        if late[:-1].any():
-            torque = np.column_stack(
-                [
-                    np.diff(np.interp(time[rows] + delay, time, column))
-                    for delay, column in zip(late[:-1], impulse.T, strict=True)
-                ]
-            )
-            torque /= dt
+        if stride == 1 and not late[:-1].any():
+            torque = raw.torque[starts]
         else:
-            torque = raw.torque[starts] if stride == 1 else np.diff(impulse[rows], axis=0) / dt
+            # A change of averaged velocities is by the torque with the same average.
+            where = slice(None) if late[:-1].any() else own
+            impulses = [
+                _averaged(time[where], column[where], time[rows] + delay, half)
+                for delay, column in zip(late[:-1], impulse.T, strict=True)
+            ]
+            torque = np.diff(np.column_stack(impulses), axis=0) / dt
         found.append(np.hstack([states[:-1], torque, dt, states[1:], time[starts, np.newaxis]]))
     width = 5 * raw.position.shape[1] + 2
     return np.vstack(found) if found else np.empty((0, width))

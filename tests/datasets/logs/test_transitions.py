@@ -76,6 +76,21 @@ def test_velocities_of_long_strides_are_means_around_the_state(load):
     assert_array_equal(found[0], noisy[0])  # there are no rows before the first
 
 
+def test_a_change_of_averaged_velocities_is_by_torques_with_the_same_average(load):
+    """Masses of 2 and 5 kg under torques that change in each row, as those of a feedback on noisy velocities do."""
+    t, masses = 0.002 * np.arange(600), np.array([2.0, 5.0])
+    torque = np.random.RandomState(0).uniform(-1.0, 1.0, (len(t), 2))
+    v = 0.002 * np.vstack([np.zeros(2), np.cumsum(torque[:-1], axis=0)]) / masses
+    q = 0.002 * np.vstack([np.zeros(2), np.cumsum(0.5 * (v[:-1] + v[1:]), axis=0)])
+    table = table_of(t)
+    table[:, [BY_NUMBER["position"], BY_NUMBER["velocity"]]] = np.stack([q, v], axis=1)
+    table[:, BY_NUMBER["current"]] = torque / GAIN
+    for stride in (5, 12):
+        states, torques, dt, then = parts(log_transitions(load(table, max_gap=0.1), stride=stride))
+        assert_allclose(then[:, 2:] - states[:, 2:], torques * dt[:, np.newaxis] / masses, atol=1e-9)
+        assert torques.std(axis=0).min() > 0.05
+
+
 @pytest.mark.parametrize("rows_late", [0.0, 0.5, 0.8])
 def test_positions_are_taken_at_the_time_of_late_velocities(load, rows_late):
     t, late = 0.03 * np.arange(400), 0.03 * rows_late
