@@ -213,3 +213,15 @@ def test_points_at_all_rows_give_the_exact_likelihood(noise):
     both = EGPRegressor(kernel=exact.kernel_ + WhiteKernel(noise, "fixed"), max_iter=0)
     all_rows = np.vstack([x, x_new])
     assert bound < both.fit(all_rows, all_rows[:, 0] * np.sin(all_rows[:, 0])).log_marginal_likelihood_value_
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_weak_signal_that_a_sample_does_not_show_is_found(seed):
+    """The wave has 5 % of the variance. A kernel like white noise explains a sample of 300 rows as well."""
+    rng = np.random.RandomState(100 + seed)
+    X = rng.rand(1000, 4)
+    truth = 0.3 * np.sin(5.0 * X[:, 0])
+    y = truth + rng.randn(1000)
+    model = EGPRegressor().fit(X[:500], y[:500])
+    assert model.noise_variance_ > 0.7
+    assert np.sqrt(np.mean((model.predict(X[500:]) - truth[500:]) ** 2)) < 0.15

@@ -375,17 +375,20 @@ def lowest(function: Callable[[np.ndarray], np.ndarray], low: float, high: float
     """The lowest point of a smooth function of many points at once, and its value there."""
     for _ in range(2):
         points = np.linspace(low, high, _POINTS)
-        values = function(points)
+        values = np.where(np.isnan(found := function(points)), np.inf, found)
         best = int(np.argmin(values))
         low, high = points[max(best - 1, 0)], points[min(best + 1, _POINTS - 1)]
-    if 0 < best < _POINTS - 1:
-        # The parabola through three points.
-        before, here, after = values[best - 1 : best + 2].tolist()
-        bend, slope = before - 2.0 * here + after, 0.5 * (after - before)
-        if bend > 0.0:
-            step = slope / bend
-            return float(points[best] - step * (points[best + 1] - points[best])), here - 0.5 * slope * step
-    return float(points[best]), float(values[best])
+    lowest_so_far = float(points[best]), float(values[best])
+    if not 0 < best < _POINTS - 1 or not np.isfinite(values[best - 1 : best + 2]).all():
+        return lowest_so_far
+    # The lowest point of the parabola through three points.
+    before, here, after = values[best - 1 : best + 2].tolist()
+    bend = before - 2.0 * here + after
+    if not bend > 0.0:
+        return lowest_so_far
+    point = points[best] + 0.5 * (before - after) / bend * (points[1] - points[0])
+    value = float(function(np.array([point]))[0])
+    return (float(point), value) if value < lowest_so_far[1] else lowest_so_far
 
 
 def means_of_groups(squares: np.ndarray, counts: np.ndarray, labels: np.ndarray) -> np.ndarray:

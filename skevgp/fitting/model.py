@@ -39,6 +39,8 @@ _HIGH_RATIO = 1e9
 LEAST_TOL, ENOUGH = 0.01, 1.5e-5
 # The tolerance for a flat loss of mini-batches: in nats, or in nats per row if that is more.
 _FLAT, _FLAT_PER_ROW = 0.1, 0.005
+# Share of the mean noise variance. A signal this small costs almost nothing, and its gradient shows if it should grow.
+LITTLE = 1e-4
 # Relative size of the rounding errors in a bound on all rows.
 _BOUND_ROUNDING = 1e-8
 # The mode of kernel and noise is found to so many nats, in up to so many iterations, before draws around it.
@@ -143,10 +145,25 @@ class Model:
 
     @property
     def samples_agree(self) -> bool:
-        """Whether the optimum of the last sample, and the curvature there, are almost those of all rows."""
-        if self.is_exact or not self.samples:
-            return self.is_exact
-        return self._count(self.samples[-1]) * self.samples[-1] >= len(self.rows)
+        """Whether a fit to more rows continues along the curvature of the sample before.
+
+        Samples of the exact model have no inducing points, whose cost would move their optimum.
+        """
+        if not self.samples:
+            return False
+        return self.is_exact or self._count(self.samples[-1]) * self.samples[-1] >= len(self.rows)
+
+    def shows_signal(self, fit: Fit) -> bool:
+        """Whether a fit to a sample gains more over the features alone than its learned numbers may by chance."""
+        # With little signal, the likelihood of a sample may have its maximum where the kernel is as white as noise. A
+        # few inducing points cannot represent such a kernel.
+        free = self.table["noise"].free & self.table["signal"].free
+        if not self.is_exact or fit.n_rows is None or not free.all():
+            return True
+        noise = self.alone.noise
+        little = np.minimum(fit.values["signal"], LITTLE * noise / self.mean_precision)
+        alone = self.bound_at(fit.values | {"signal": little, "noise": noise}, fit.n_rows)
+        return fit.n_rows / len(self.rows) * (fit.bound - alone) > self.rules.chance * self.n_learned
 
     def objective(self, table: ParameterTable, n_rows: int | None = None) -> Objective:
         """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all.
@@ -383,7 +400,7 @@ class Model:
             tolerance = Tolerance(self.tol / n_rows)
         else:
             share = ENOUGH
-            if start.n_rows is None and not start.cold and self.samples_agree:
+            if start.n_rows is None and start.metric is not None:
                 share *= self.rules.last_share
             tolerance = Tolerance(LEAST_TOL / n_rows, share, -self.bound_alone / n_rows)
         objective, curvature = self.objective(table, start.n_rows), None

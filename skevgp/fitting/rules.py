@@ -70,6 +70,8 @@ class Rules:
     growth: int = 4
     # Factor on the tolerance of the fit to all rows, if the last sample had almost the same optimum.
     last_share: float = 3.0
+    # A fit to a sample shows no signal if it gains less than so many nats for each learned number over noise alone.
+    chance: float = 3.0
     # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
     # first ones. A small sample may not show that a column matters.
     longest: float = 3.0

@@ -12,15 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from ..model.parameters import Values
-from .model import Model
+from .model import LITTLE, Model
 from .runs import Fit, Start, better
 
 # In nats. With a smaller difference, rounding decides whether a white kernel or noise has the higher bound.
 _WORTH = 0.01
 # In nats. More rows show that a column matters if its first length scale raises the bound by more.
 _SEEN = 1.0
-# Share of the mean noise variance. A signal this small costs almost nothing, and its gradient shows if it should grow.
-_LITTLE = 1e-4
 
 
 class _StoppedError(Exception):
@@ -69,7 +67,7 @@ class Search:
         if self._is_doubtful(best):
             # A fit with little signal, from the noise that is best for the features alone.
             noise = self.model.alone.noise
-            little = np.minimum(first["signal"], _LITTLE * noise / self.model.mean_precision)
+            little = np.minimum(first["signal"], LITTLE * noise / self.model.mean_precision)
             self._released(self._fit(Start(first | {"signal": little, "noise": noise}, self.max_iter)))
 
     def _fit(self, start: Start) -> Fit:
@@ -109,11 +107,11 @@ class Search:
         few = min(2 * stage, self.max_iter)
         best = self._stages(values, few, samples[0])
         for n_rows in samples[1:]:
-            if self.collapsed(best):
+            if self._lost(best):
                 best = self._stages(values, few, n_rows)
             else:
                 best = self._fit(self._continued(best, values, n_rows))
-        if not self.collapsed(best):
+        if not self._lost(best):
             best = self._with_noise(self._fit(self._continued(best, values)))
             if not self.collapsed(best):
                 return best
@@ -192,6 +190,10 @@ class Search:
         if (fit.values["noise"] > self.rules.collapsed * self.model.scatter).any():
             return True
         return self._below(fit)
+
+    def _lost(self, fit: Fit) -> bool:
+        """Whether a fit to a sample found no signal. More rows may show one, from the first values."""
+        return self.collapsed(fit) or not self.model.shows_signal(fit)
 
     def _bound(self, fit: Fit) -> float:
         """The bound of a fit without the prior of kernel and noise, which the features alone do not have."""

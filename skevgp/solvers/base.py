@@ -113,12 +113,12 @@ class Guarded:
         self.x, self.loss = start.copy(), np.inf
         anywhere = np.full(len(start), np.inf)
         self.coordinates: Coordinates = Scaled(np.ones(len(start)), (-anywhere, anywhere))
-        self.last = Point(np.full(len(start), np.nan), np.nan, np.zeros(len(start)))
+        self.last: Point | None = None
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         x, pull_back = self.coordinates.at(z)
         # SciPy evaluates its start, which is often the last point.
-        if not np.array_equal(x, self.last.x):
+        if self.last is None or not np.array_equal(x, self.last.x):
             self.last = self._evaluated(x)
         # Points that overflow are recognised by their loss below.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -135,6 +135,12 @@ class Guarded:
         if ratio > 1.0:
             return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
         return loss, gradient
+
+    def at(self, z: np.ndarray) -> Point:
+        """The evaluation at z."""
+        self(z)
+        assert self.last is not None  # as z was just evaluated
+        return self.last
 
     def _evaluated(self, x: np.ndarray) -> Point:
         try:

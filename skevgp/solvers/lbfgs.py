@@ -13,7 +13,7 @@ from scipy.optimize import OptimizeResult, minimize
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import check_integer
-from .base import Callback, Guarded, Minimum, Objective, Solver, Tolerance
+from .base import Callback, Guarded, Minimum, Objective, Point, Solver, Tolerance
 from .coordinates import Coordinates, Limits, Metric, Pair, Scaled
 
 # Relative size of a step that changes the loss by its rounding error only.
@@ -56,7 +56,7 @@ class LBFGS(Solver):
     tol : float or "auto", default="auto"
         Tolerance in nats. L-BFGS restarts from its best point when three iterations in a row gain less, and stops when
         a restart gains no more. If ``"auto"``, 0.0015 % of the gain over features and noise alone, and at least 0.01.
-        It is three times as much after a large sample, see :doc:`/guide/solvers`.
+        It is three times as much in a fit that continues from a sample, see :doc:`/guide/solvers`.
     max_time : float, default=None
         Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
         calibration by ``noise_cv`` is skipped, as is the average over kernels of a fit to few rows. If None, there is
@@ -158,7 +158,7 @@ class LBFGS(Solver):
         guarded, minimum = Guarded(objective, start), Minimum(start, np.inf)
         pairs: deque[Pair] = deque(() if metric is None else metric.pairs, maxlen=self.descent.memory)
         coordinates: Coordinates = Scaled(np.ones(len(start)), limits)
-        stalled, at = 0, guarded.last
+        stalled, at = 0, Point(start, np.inf, np.zeros(len(start)))
 
         def seen(intermediate_result: OptimizeResult) -> None:
             # The loss of the iterate. A point of the line search may have a lower one by chance.
@@ -168,23 +168,23 @@ class LBFGS(Solver):
             curve.append(loss)
             enough = tolerance.at(loss)
             monitor.iteration(len(curve), loss)
-            if np.array_equal(guarded.last.x, coordinates.at(intermediate_result.x)[0]):
-                pairs.append((guarded.last.x - at.x, guarded.last.gradient - at.gradient))
-                at = guarded.last
+            here = guarded.at(intermediate_result.x)
+            pairs.append((here.x - at.x, here.gradient - at.gradient))
+            at = here
             stalled = stalled + 1 if before - loss < enough else 0
             minimum.converged = stalled > 0 and coordinates.promised(at.x, at.gradient) < enough
             if stalled >= self.descent.patience or minimum.converged:
                 raise StopIteration
 
         with monitor.keeping_the_best():
-            guarded(start)
+            at = guarded.at(start)
             # Without coordinates or iterations the start is the result.
             minimum.converged = len(start) == 0 or max_iter == 0
             x, rng = start, np.random.RandomState(0)
             for number in range(max_iter):  # at most: a start whose first line search fails has no iteration
                 if minimum.converged or minimum.n_iter >= max_iter:
                     break
-                before, stalled, at = guarded.loss, 0, guarded.last
+                before, stalled = guarded.loss, 0
                 if curvature is not None:
                     function, alike = curvature
                     here = at.gradient if function is objective and np.array_equal(at.x, x) else None
@@ -193,6 +193,7 @@ class LBFGS(Solver):
                     if number == 0 and metric is not None:
                         coordinates = metric.coordinates(unit, limits, at.x, at.gradient)
                 guarded.coordinates = coordinates
+                at = guarded.at(coordinates.of(x))
                 left = max_iter - minimum.n_iter
                 result = minimize(
                     guarded,
@@ -212,7 +213,9 @@ class LBFGS(Solver):
                 if result.status == 1:
                     break
                 # It stalled, or a line search failed. Either it has converged, or its memory is misleading.
-                if not before - guarded.loss > tolerance.at(guarded.loss):
+                enough = tolerance.at(guarded.loss)
+                ended = isinstance(coordinates, Scaled) or coordinates.promised(at.x, at.gradient) < enough
+                if ended and not before - guarded.loss > enough:
                     minimum.converged = bool(np.isfinite(guarded.loss))
                     break
                 # Start slightly away, because the loss of the best of all points is low by a rounding error too.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.calibration import VarianceSearch, calibrate, variances
+from skevgp.fitting.calibration import VarianceSearch, calibrate, lowest, variances
 from skevgp.fitting.folds import (
     CrossValidation,
     random_folds,
@@ -98,3 +98,13 @@ def test_bits_do_not_depend_on_the_number_of_threads(groups, monkeypatch):
     expected = calibrated_rows(*small(), by)
     np.testing.assert_array_equal(found.signal, expected.signal)
     np.testing.assert_array_equal(found.noise, expected.noise)
+
+
+@pytest.mark.parametrize("wall", [np.inf, np.nan])
+def test_lowest_point_is_exact_for_a_parabola_and_finite_beside_a_wall(wall):
+    point, value = lowest(lambda z: 2.0 + (z - 0.3) ** 2, -2.0, 2.0)
+    assert (point, value) == (pytest.approx(0.3, abs=1e-9), pytest.approx(2.0, abs=1e-12))
+    point, value = lowest(lambda z: np.where(z < 0.1, wall, (z - 0.12) ** 2), -2.0, 2.0)
+    assert abs(point - 0.12) < 0.1
+    assert value == pytest.approx((point - 0.12) ** 2)
+    assert lowest(lambda z: z, -2.0, 2.0) == (-2.0, -2.0)

@@ -88,9 +88,9 @@ def sampled(monkeypatch, **changes):
 
 @pytest.mark.usefixtures("_many_rows")
 def test_fit_that_begins_with_samples_ends_with_all_rows(monkeypatch):
-    model = model_of(n_inducing=5, max_iter=200)
+    model = model_of(n_inducing=5, max_iter=200, tol=0.01)
     plain = finished(model, search.search(model))
-    model = sampled(monkeypatch, max_iter=200)
+    model = sampled(monkeypatch, max_iter=200, tol=0.01)
     done = finished(model, search.search(model))
     assert done.bound > plain.bound - 0.02 * (plain.bound - model.bound_alone)
     at = model.sparse.statistics(done.values, model.blocks)

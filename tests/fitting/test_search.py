@@ -41,6 +41,7 @@ def model(**changes):
         "interpolates": False,
         "samples": (),
         "samples_agree": False,
+        "shows_signal": lambda fit: True,
         "lengthscale_mask": np.array([True, False]),
         "place": None,
         "warm": None,
@@ -198,6 +199,14 @@ def test_what_collapsed_on_a_sample_starts_again_on_more_rows():
 
 
 # --- samples of the rows ----------------------------------------------------------------------------------------------
+
+
+def test_sample_without_a_signal_is_left():
+    own = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000), shows_signal=lambda fit: fit.n_rows != 1000)
+    made, best = drive(own, (5.0, {"stretch": 0.1}), (4.0, GOOD), (3.0, GOOD))
+    assert [(start.n_rows, start.cold) for start in made] == [(1000, True), (4000, True), (None, False)]
+    np.testing.assert_array_equal(made[1].values["hyperparameters"], made[0].values["hyperparameters"])
+    assert best.bound == 3.0
 
 
 def test_fit_climbs_from_sample_to_sample_to_all_rows():

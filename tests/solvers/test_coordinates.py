@@ -113,3 +113,17 @@ def test_search_that_continues_needs_few_evaluations_and_may_leave_a_limit():
     assert warm.x[0] < limits[1][0]
     assert warm.loss == pytest.approx(cold.loss, abs=1e-7)
     assert n_warm < 0.7 * n_cold
+
+
+def test_coordinate_at_its_limit_is_released_before_the_end():
+    """Along the curvature, the second coordinate is at its optimum at once. The first one leaves its limit later."""
+
+    def function(x):
+        loss = x[0] * (1.0 - 1000.0 * x[1]) + 0.5 * x[0] ** 2 + 0.5 * (x[1] - 0.01) ** 2
+        return float(loss), np.array([1.0 - 1000.0 * x[1] + x[0], x[1] - 0.01 - 1000.0 * x[0]])
+
+    limits, pair = (np.zeros(2), np.array([10.0, 1.0])), np.array([0.0, 1e-3])
+    metric, curvature = Metric(((pair, pair),), np.zeros(2)), (function, np.arange(2))
+    found = LBFGS().minimise(function, np.zeros(2), limits, 200, Tolerance(1e-4), Monitor(), curvature, metric)
+    assert found.converged
+    np.testing.assert_allclose(found.x, [10.0, 1.0])

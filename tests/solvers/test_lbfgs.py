@@ -45,6 +45,12 @@ def test_losses_far_above_the_best_grow_as_their_logarithm_with_the_slope_to_mat
         assert slope[0] == pytest.approx((nearby[1] - nearby[0]) / 2e-5, rel=1e-6)
 
 
+def test_function_without_coordinates_is_evaluated():
+    nothing = np.zeros(0)
+    minimum = lbfgs(lambda x: (3.0, nothing), nothing, (nothing, nothing), 10, 1e-9)
+    assert (minimum.loss, minimum.converged) == (3.0, True)
+
+
 def test_lbfgs_says_that_iterations_ran_out_and_none_keep_the_start():
     minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 3, 1e-12)
     assert (minimum.converged, minimum.n_iter) == (False, 3)
