@@ -173,6 +173,8 @@ RULES_OFF = {
     "first-noise": Rule("the noise starts low", (field(first_noise=0.5),)),
     "other-starts": Rule("other starts after a collapsed fit", (field(other_starts=()),)),
     "much-noise": Rule("a second start with much noise", (field(much_noise=None),)),
+    "short": Rule("a second start with shorter length scales", (field(short=None),)),
+    "low-noise": Rule("a fit almost without noise is tried with more", (field(low_noise=0.0),), "many"),
     "few-rows": Rule("a prior of kernel and noise, and an average over draws", (field(few_rows=0.0),)),
     "forward-selection": Rule(
         "a start by forward selection", (constant(model.Model, "by_forward_selection", lambda self: None),)
@@ -191,13 +193,19 @@ RULES_OFF = {
             edited(
                 search.Search,
                 "_climb",
-                "if not self.collapsed(best):\n        best =",
+                "if not self._lost(best):\n        best =",
                 "if True:\n        best =",
             ),
         ),
         "many",
     ),
-    "longest": Rule("long length scales are tried short", (field(longest=np.inf),), "many"),
+    "sample-signal": Rule("a sample without a signal is left", (field(chance=-np.inf),), "many"),
+    "sample-curvature": Rule(
+        "more rows go on along the curvature of a sample", (constant(model.Model, "samples_agree", False),), "many"
+    ),
+    "longest": Rule(
+        "long length scales are tried short", (field(longest=np.inf), field(longest_of_all=np.inf)), "many"
+    ),
     "last-start": Rule("a last start with little signal", (field(last_start=False),)),
     "hidden-noise": Rule(
         "features may hide the noise",
@@ -231,7 +239,7 @@ RULES_OFF = {
     # L-BFGS.
     "curvature": Rule(
         "steps are scaled by the curvature",
-        (constant(lbfgs, "curvature_units", lambda objective, x, alike, n: np.ones(len(x))),),
+        (constant(lbfgs, "curvature_units", lambda objective, x, alike, n, here: np.ones(len(x))),),
         "sparse",
     ),
     "cold": Rule(
@@ -245,7 +253,7 @@ RULES_OFF = {
             edited(
                 lbfgs.LBFGS,
                 "minimise",
-                "if not before - guarded.loss > tolerance.at(guarded.loss):",
+                "if ended and not before - guarded.loss > enough:",
                 "if True:",
             ),
         ),
