@@ -33,7 +33,7 @@ class Adam(MiniBatchSolver):
         First step size.
     natural_gradient : bool, default=False
         Whether to move q by natural gradients (Hensman et al. 2013), which needs ``posterior="full"``. Adam then moves
-        kernel, noise and inducing points only. For a million rows, use ``Adam(batch_size=2000,
+        kernel, noise and inducing points only. For millions of rows, use ``Adam(batch_size=2000,
         natural_gradient=True)``.
     n_restarts : int, default=0
         Number of further fits from other starts, as in `LBFGS`.
