@@ -14,6 +14,7 @@ DATA = {
     "kin40k": "kin40k",
     "airfoil": "airfoil",
     "smooth": "smooth, 8 columns",
+    "pendulum": "pendulum, 2 outputs",
     "cartpole": "cartpole, 4 outputs",
     "acrobot": "acrobot, 4 outputs",
 }
