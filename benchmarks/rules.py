@@ -201,7 +201,7 @@ RULES_OFF = {
     ),
     "sample-signal": Rule("a sample without a signal is left", (field(chance=-np.inf),), "many"),
     "sample-curvature": Rule(
-        "more rows go on along the curvature of a sample", (constant(model.Model, "samples_agree", False),), "many"
+        "more rows go on along the curvature of a sample", (constant(model.Model, "keeps_metric", False),), "many"
     ),
     "longest": Rule(
         "long length scales are tried short", (field(longest=np.inf), field(longest_of_all=np.inf)), "many"

@@ -104,7 +104,7 @@ for stage, colour in zip(tries, colours, strict=True):
     left.plot(times, stage.states[:-1, 0], color=colour, label=label)
 for turn in (-1.0, 1.0):
     left.axhline(turn * np.pi, color="0.3", linestyle=":", zorder=0)
-left.set(title="First link", xlabel="time (s)", ylabel="angle from hanging (rad)", ylim=(-11.0, 5.0))
+left.set(title="First link", xlabel="time (s)", ylabel="angle from hanging (rad)", ylim=(-17.0, 5.0))
 left.legend(title="data", loc="lower left")
 middle.plot(times, last.torques, color="#D55E00")
 middle.set(title="Last try", xlabel="time (s)", ylabel="torque (N m)", ylim=(-1.1 * LIMIT, 1.1 * LIMIT))

@@ -208,8 +208,9 @@ class NominalDynamics(ParametricMap, RobotMap):
     # --- the midpoint rule --------------------------------------------------------------------------------------------
 
     def _half_step(self) -> float:
+        assert self.dt is not None  # as for all of these maps
         assert not isinstance(self.dt, str)  # as _check_terms has found
-        return 0.5 * (self.dt or 0.0)
+        return 0.5 * self.dt
 
     def _middle(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the state in the middle of the time step, by Euler's rule, and the input."""

@@ -144,8 +144,8 @@ class Model:
         return min(len(self.rows), n_rows**2 / self.samples[0]) / n_rows
 
     @property
-    def samples_agree(self) -> bool:
-        """Whether a fit to more rows continues along the curvature of the sample before.
+    def keeps_metric(self) -> bool:
+        """Whether a fit to more rows moves along the curvature of the sample before it.
 
         Samples of the exact model have no inducing points, whose cost would move their optimum.
         """

@@ -68,9 +68,10 @@ class Rules:
     # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
     # `LARGEST_SAMPLE`, are left out.
     growth: int = 4
-    # Factor on the tolerance of the fit to all rows, if the last sample had almost the same optimum.
+    # Factor on the tolerance of a fit to all rows that moves along the curvature of a sample.
     last_share: float = 3.0
-    # A fit to a sample shows no signal if it gains less than so many nats for each learned number over noise alone.
+    # An exact fit to a sample shows no signal if it gains less than so many nats for each learned number of kernel,
+    # signal and noise over the features alone.
     chance: float = 3.0
     # Before a fit to more rows, columns with length scales of more than so many times the first ones are tried with the
     # first ones. A small sample may not show that a column matters.

@@ -133,7 +133,7 @@ class Search:
             bound_of_trial = self.model.bound_at(trial, n_rows)
             if bound_of_trial > bound + _SEEN:
                 values, bound = trial, bound_of_trial
-        return Start(values, self.max_iter, n_rows=n_rows, metric=fit.metric if self.model.samples_agree else None)
+        return Start(values, self.max_iter, n_rows=n_rows, metric=fit.metric if self.model.keeps_metric else None)
 
     def _stages(self, values: Values, max_iter: int, n_rows: int | None = None) -> Fit:
         """Fit in stages: after the first iterations, inducing points are placed again under the learned kernel."""

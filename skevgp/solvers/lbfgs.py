@@ -147,8 +147,8 @@ class LBFGS(Solver):
             Function like ``objective``, whose curvature at the start gives the scale of steps, and an integer for each
             coordinate. Coordinates with the same integer have the same scale. If None, x is not scaled.
         metric : Metric, default=None
-            Curvature of a similar function near the start. The first start moves along it, and ends the search when
-            neither an iteration gained nor a Newton step promises more than the tolerance.
+            Curvature of a similar function near the start. The first start moves along it. The search ends when an
+            iteration gains less than the tolerance, and a Newton step promises less.
 
         Returns
         -------

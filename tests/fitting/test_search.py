@@ -40,7 +40,7 @@ def model(**changes):
         "alone": FeaturesAlone(-np.inf, np.ones(2)),
         "interpolates": False,
         "samples": (),
-        "samples_agree": False,
+        "keeps_metric": False,
         "shows_signal": lambda fit: True,
         "lengthscale_mask": np.array([True, False]),
         "place": None,
@@ -226,7 +226,7 @@ def test_fit_climbs_from_sample_to_sample_to_all_rows():
 
 @pytest.mark.parametrize("agree", [True, False])
 def test_fit_to_more_rows_moves_along_the_curvature_of_a_sample_that_agrees(agree):
-    own = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000), samples_agree=agree)
+    own = model(rules=replace(OWN, much_noise=None), samples=(1000, 4000), keeps_metric=agree)
     made, _ = drive(own, (5.0, {"metric": "of 1000"}), (4.0, {"metric": "of 4000"}), (3.0, GOOD))
     assert [start.metric for start in made] == ([None, "of 1000", "of 4000"] if agree else 3 * [None])
 
