@@ -4,7 +4,7 @@
     python benchmarks/control.py rollouts --models EVGP-IFG  # one model: twenty minutes
     python benchmarks/control.py rollouts --systems iiwa14 --models EVGP-IFG  # not among the three
     python benchmarks/control.py swing_up --seeds 10         # hours of one core
-    python benchmarks/control.py swing_up --systems pendulum --models evgp-ifg
+    python benchmarks/control.py swing_up --systems pendulum --models evgp-ifg --noises 0.01
     python benchmarks/control.py tracking                    # a quarter of an hour of one core
     python benchmarks/control.py swing_up --quick            # the pendulum, one seed: half a minute
 
@@ -265,10 +265,9 @@ SECONDS = (1.5, 3.0, 4.5, 9.0, 30.0)
 NOISES = (0.0, 0.01)
 LENGTHS = (10, 25)
 SYSTEMS = ("cartpole", "pendulum")
-TRUTHS = 3  # number of seeds, which differ in the first plans only
 SWING_UPS = {"evgp-ifg": "EVGP-IFG", "firm": "EVGP-IFG, firm", "gp": "without physics", "truth": "the truth"}
 
-# One run. The truth has no data, and no noise.
+# One run. The truth has no data, and seeds differ in the first plans and in the noise.
 SwingUp = namedtuple("SwingUp", "system model seconds noise length seed size")
 
 
@@ -308,13 +307,19 @@ def firm(system: str) -> dict[str, np.ndarray]:
     return {"coef_prior": CoefPrior(scale=scale)}
 
 
+def scatter(system: str, seed: int) -> np.ndarray:
+    """Return the standard deviation of each state in the largest data."""
+    n_trajectories = round(SECONDS[-1] / (mpc.LENGTH * mpc.DT))
+    return make_dynamics(system, n_trajectories, mpc.LENGTH, dt=mpc.DT, random_state=seed).target.std(axis=0)
+
+
 def run_swing_up(cell: SwingUp) -> dict[str, Any]:
     """Learn, and swing up. Seconds are processor time of one thread."""
     task = mpc.TASKS[cell.system]
     with harness.one_thread():
         start = time.process_time()
         if cell.model == "truth":
-            model, noise = Truth(cell.system), 0.0
+            model, noise = Truth(cell.system), cell.noise * scatter(cell.system, cell.seed)
         else:
             prior = firm(cell.system) if cell.model == "firm" else {}
             data = (cell.seconds, cell.model != "gp", cell.noise, cell.seed, cell.length)
@@ -340,9 +345,9 @@ def swing_up_cells(options: Any) -> list[SwingUp]:
     cells = []
     for seed, system in itertools.product(options.seeds, options.systems or SYSTEMS):
         for model in options.models or SWING_UPS:
-            sizes = itertools.product(SECONDS, NOISES, LENGTHS)
+            sizes = itertools.product(SECONDS, options.noises or NOISES, LENGTHS)
             if model == "truth":
-                sizes = [(0.0, 0.0, 0)] if seed < TRUTHS else []
+                sizes = [(0.0, noise, 0) for noise in options.noises or NOISES]
             cells += [SwingUp(system, model, *size, seed, "full") for size in sizes]
     return cells
 
@@ -582,6 +587,7 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", choices=ROLLOUT_SYSTEMS, help="default: all, of rollouts the first 3")
     models = [*ROLLOUT_MODELS, *SWING_UPS]
     parser.add_argument("--models", nargs="+", choices=models, help="default: all")
+    parser.add_argument("--noises", nargs="+", type=float, choices=NOISES, help="of swing-ups; default: both")
     options = harness.parse(parser)
     cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, options.part)

@@ -61,13 +61,11 @@ class StackedWhitening:
 
     def times_inverse(self, U: np.ndarray) -> np.ndarray:
         """L⁻¹ U for U (..., m, n)."""
-        sets = zip(self._pairs(), self._split(U), strict=True)
-        return np.concatenate([part.L_inv @ own / np.sqrt(c) for (c, part), own in sets], axis=-2)
+        return self._times(self._inverses, U)
 
     def times_inverse_transposed(self, U: np.ndarray) -> np.ndarray:
         """L⁻ᵀ U for U (..., m, n)."""
-        sets = zip(self._pairs(), self._split(U), strict=True)
-        return np.concatenate([part.L_inv.T @ own / np.sqrt(c) for (c, part), own in sets], axis=-2)
+        return self._times(self._inverses.transpose(0, 2, 1), U)
 
     def solve(self, prepared: Any, out: np.ndarray) -> np.ndarray:
         """V = L⁻¹ k(X_m, X), written to ``out`` (m, n)."""
@@ -80,6 +78,15 @@ class StackedWhitening:
         """The variance k(x, x) - |v|² (n,) for a prediction: each draw's is clipped at its rounding error."""
         sets = zip(self._pairs(), self._split(V), strict=True)
         return np.sum([c * part.remaining(prepared, own / np.sqrt(c)) for (c, part), own in sets], axis=0)
+
+    @cached_property
+    def _inverses(self) -> np.ndarray:
+        """The inverse of L as its blocks (S, m / S, m / S)."""
+        return np.array([part.L_inv / np.sqrt(c) for c, part in self._pairs()])
+
+    def _times(self, blocks: np.ndarray, U: np.ndarray) -> np.ndarray:
+        """The product of a matrix with these blocks and U (..., m, n)."""
+        return (blocks @ U.reshape(*U.shape[:-2], *blocks.shape[:2], -1)).reshape(U.shape)
 
     def _pairs(self) -> list[tuple[float, Whitening]]:
         return list(zip(self.factors.tolist(), self.parts, strict=True))
