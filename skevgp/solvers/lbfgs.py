@@ -140,7 +140,7 @@ class LBFGS(Solver):
             Maximum number of iterations over all starts.
         tolerance : Tolerance
             Tolerance of the loss. A start ends when ``descent.patience`` iterations in a row gain less. The solver ends
-            when a whole start gains no more.
+            when a whole start gains no more, or when the loss next to the best point is worse by more.
         monitor : Monitor
             Object that is notified of each iteration, and may end the iterations.
         curvature : tuple, default=None
@@ -194,6 +194,11 @@ class LBFGS(Solver):
                         coordinates = metric.coordinates(unit, limits, at.x, at.gradient)
                 guarded.coordinates = coordinates
                 at = guarded.at(coordinates.of(x))
+                if number > 0 and at.loss - before > tolerance.at(before):
+                    # A hair away, the loss is worse by more than the tolerance, because of the rounding errors or the
+                    # jitter of a covariance almost without noise. Another start would gain by chance only.
+                    minimum.converged = True
+                    break
                 left = max_iter - minimum.n_iter
                 result = minimize(
                     guarded,

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
-from scipy.optimize import rosen, rosen_der
+from scipy.optimize import minimize, rosen, rosen_der
 
 from skevgp.solvers import LBFGS
+from skevgp.solvers import lbfgs as solver
 from skevgp.solvers.base import Guarded, Tolerance
 from skevgp.solvers.lbfgs import curvature_units
 from skevgp.utils.linalg import NotPositiveDefiniteError
@@ -106,16 +107,31 @@ def test_ctrl_c_keeps_the_best_point_so_far():
     assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_rounding_errors_do_not_end_the_way(seed):
-    """A loss with errors far above the tolerance, as near a singular matrix: the best is as good as they allow."""
+def rough(size, seed):
+    """Rosenbrock's function with errors, as a likelihood near a singular matrix has."""
     directions = np.random.RandomState(seed).randn(2)
 
-    def rough(x):
+    def of(x):
         value, gradient = rosenbrock(x)
-        return value + 1e-9 * np.sin(1e13 * (x @ directions)), gradient
+        return value + size * np.sin(1e13 * (x @ directions)), gradient
 
-    assert lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-12).loss < 1e-6
+    return of
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rounding_errors_do_not_end_the_way(seed):
+    """The errors are far above the tolerance, and the best point is as good as they allow."""
+    assert lbfgs(rough(1e-9, seed), np.array([-1.0, 2.0]), FREE, 500, 1e-12).loss < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rounding_errors_above_the_tolerance_are_not_searched_for_a_lower_one(seed, monkeypatch):
+    starts = []
+    monkeypatch.setattr(solver, "minimize", lambda *told, **options: starts.append(0) or minimize(*told, **options))
+    minimum = lbfgs(rough(1e-4, seed), np.array([-1.0, 2.0]), FREE, 500, 1e-12)
+    assert minimum.converged
+    assert minimum.loss < 1e-2
+    assert len(starts) == 1
 
 
 def test_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
