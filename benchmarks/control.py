@@ -17,10 +17,10 @@ of each state's standard deviation. iiwa14 learns from its moves of 50 steps, an
 s). The limits are 100 N on the cart and 2 N m on the pendulum. The pendulum needs more than twice this torque to be
 held level. A run succeeds if the pole is within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG,
 or a Gaussian process of the change of state without physics. Both have sines and cosines for the kernel, and learn from
-short trajectories from random states. "Firm" is EVGP-IFG with the prior of the paper's setting, with a hundredth of its
-scale for the weights of states in states. This prior has rough physics and exact kinematics. Noise is a share of the
-states' standard deviation, in the data and in the states that the planner gets. "The truth" plans on the simulated
-system.
+short trajectories from random states. "Without f" are the features of EVGP-IFG without a Gaussian process. "Second
+order" is EVGP-IFG with one more feature, for the pendulum: q̇ cos q, by which the acceleration of gravity changes within
+a step. Noise is a share of the states' standard deviation, in the data and in the states that the planner gets. "The
+truth" plans on the simulated system.
 
 *tracking* has arms with unknown loads. The iiwa14 of examples/computed_torque.py has a load and friction that its model
 does not know. Its masses are 5 % off. All models learn from one log of a minute at 50 Hz. They are compared on other
@@ -45,6 +45,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))  # for
 import numpy as np
 import pandas as pd
 from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from sklearn.pipeline import make_union
+from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils import Bunch
 
 import computed_torque as arms
@@ -54,8 +57,8 @@ from computed_torque import DT, ComputedTorque
 from harness import figure_of, text
 from paper.models import SIZES as PAPERS_SIZES
 from paper.models import SYSTEMS as PAPERS_SYSTEMS
-from paper.models import Fit, build, fitted_part, groups_of, papers_prior
-from skevgp import CoefPrior, EVGPRegressor, rollout
+from paper.models import Fit, build, fitted_part, groups_of
+from skevgp import EVGPRegressor, rollout
 from skevgp.datasets import load_robot, make_dynamics
 from skevgp.datasets.plant import Plant
 from skevgp.features import InertiaForceGravity
@@ -265,7 +268,15 @@ SECONDS = (1.5, 3.0, 4.5, 9.0, 30.0)
 NOISES = (0.0, 0.01)
 LENGTHS = (10, 25)
 SYSTEMS = ("cartpole", "pendulum")
-SWING_UPS = {"evgp-ifg": "EVGP-IFG", "firm": "EVGP-IFG, firm", "gp": "without physics", "truth": "the truth"}
+SWING_UPS = {
+    "evgp-ifg": "EVGP-IFG",
+    "second": "EVGP-IFG, second order",
+    "weights": "EVGP-IFG without f",
+    "gp": "without physics",
+    "truth": "the truth",
+}
+# Systems of these models only.
+SECOND_ORDER = ("pendulum",)
 
 # One run. The truth has no data, and seeds differ in the first plans and in the noise.
 SwingUp = namedtuple("SwingUp", "system model seconds noise length seed size")
@@ -299,12 +310,19 @@ class Truth:
         return (mean, slopes, np.zeros_like(mean), np.zeros_like(slopes)) if return_std else (mean, slopes)
 
 
-def firm(system: str) -> dict[str, np.ndarray]:
-    """Return the prior of EVGP-IFG's weights with exact kinematics, as an argument of `EVGPRegressor`."""
-    n_states = 2 * Plant(system).layout.n_joints
-    scale = np.array(papers_prior(InertiaForceGravity(system, dt=mpc.DT), n_states).scale)
-    scale[:, :n_states] *= 0.01
-    return {"coef_prior": CoefPrior(scale=scale)}
+def rotated_gravity(X: np.ndarray) -> np.ndarray:
+    """Return q̇ cos q of a pendulum."""
+    return X[:, 1:2] * np.cos(X[:, :1])
+
+
+def settings_of(model: str, system: str) -> dict[str, Any]:
+    """Return arguments of `EVGPRegressor` that are not those of EVGP-IFG."""
+    if model == "weights":
+        return {"kernel": ConstantKernel(1e-10, "fixed") * RBF(1.0, "fixed")}
+    if model == "second":
+        gravity = InertiaForceGravity(system, dt=mpc.DT)
+        return {"feature_map": make_union(gravity, FunctionTransformer(rotated_gravity))}
+    return {}
 
 
 def scatter(system: str, seed: int) -> np.ndarray:
@@ -321,9 +339,8 @@ def run_swing_up(cell: SwingUp) -> dict[str, Any]:
         if cell.model == "truth":
             model, noise = Truth(cell.system), cell.noise * scatter(cell.system, cell.seed)
         else:
-            prior = firm(cell.system) if cell.model == "firm" else {}
             data = (cell.seconds, cell.model != "gp", cell.noise, cell.seed, cell.length)
-            learned = mpc.learn(cell.system, *data, **prior)
+            learned = mpc.learn(cell.system, *data, **settings_of(cell.model, cell.system))
             model, noise = learned.model.compile(include_noise=False), learned.noise
         middle = time.process_time()
         found = mpc.swing_up(model, task, noise, cell.seed)
@@ -345,6 +362,8 @@ def swing_up_cells(options: Any) -> list[SwingUp]:
     cells = []
     for seed, system in itertools.product(options.seeds, options.systems or SYSTEMS):
         for model in options.models or SWING_UPS:
+            if model == "second" and system not in SECOND_ORDER:
+                continue
             sizes = itertools.product(SECONDS, options.noises or NOISES, LENGTHS)
             if model == "truth":
                 sizes = [(0.0, noise, 0) for noise in options.noises or NOISES]

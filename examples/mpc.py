@@ -244,7 +244,7 @@ def learn(
     data = make_dynamics(system, n_trajectories, length, dt=DT, noise=noise, input_noise=noise, random_state=seed)
     settings = {"kernel_map": AngleEncoder(system), "n_inducing": 100, "random_state": seed} | settings
     if physics:
-        model = EVGPRegressor(InertiaForceGravity(system, dt=DT), **settings)
+        model = EVGPRegressor(**{"feature_map": InertiaForceGravity(system, dt=DT)} | settings)
     else:
         model = ResidualRegressor(EVGPRegressor(**settings))
     model.fit(data.data, data.target, groups=data.groups)
