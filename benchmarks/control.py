@@ -380,8 +380,9 @@ def swing_up_tables(rows: pd.DataFrame) -> harness.Tables:
         for n_seconds in seconds:
             some = own["success"] if model == "truth" else own.loc[own["seconds"] == n_seconds, "success"]
             line[f"{n_seconds} s"] = f"{some.sum()} of {len(some)}" if len(some) else ""
-        upright = own.loc[own["success"], "upright_from"].median()
-        line |= {"upright from, s": f"{upright:.2f}", "processor, s": f"{own['control_seconds'].median():.1f}"}
+        upright = own.loc[own["success"], "upright_from"]
+        line["upright from, s"] = f"{upright.median():.2f}" if len(upright) else ""
+        line["processor, s"] = f"{own['control_seconds'].median():.1f}"
         lines.append(line)
     return {"swing-ups": pd.DataFrame(lines)}
 
