@@ -235,7 +235,7 @@ SAID = [
     ("docs/reproduction", "| cartpole_damped | 60 | 0.011 | {} | {} |", lambda: errors("cartpole_damped")["ours"]),
     ("docs/reproduction", "| acrobot | 150 | 0.131 | {} | {} |", lambda: errors("acrobot")["ours"]),
     ("docs/reproduction", "range, the error of cartpole_damped is {}.", lambda: cell("cartpole_damped")[1:]),
-    ("docs/reproduction", "about as good ({})", lambda: cell("acrobot", "RES-VGP")[:1]),
+    ("docs/reproduction", "on the acrobot ({})", lambda: cell("acrobot", "RES-VGP")[:1]),
     ("docs/which_model", "physics alone |" + 9 * " {} |", lambda: arm("least squares, prior")),
     ("docs/which_model", "| `InverseDynamics` | **{}** |" + 8 * " {} |", lambda: arm("EVGP")),
     (
