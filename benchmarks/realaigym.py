@@ -12,16 +12,16 @@ score are those of the leaderboards of RealAIGym (V2, simulation; dfki-ric-under
 A run of the benchmark learns as in examples/double_pendulum.py. The first 10 s of data are random torques. Each
 following stage is recorded with the controller that was learned from all earlier data. The controller has plans by
 iLQR, time-varying LQR along the plans and LQR at the goal (examples/mpc.py). It gets the learned model and measured
-states, never the true robot. The models are:
+states, and no equations of the true robot. The models are:
 
 - IFG: EVGP with `InertiaForceGravity`. Masses, centres of mass and inertias are unknown.
 - GP: a Gaussian process for the change of the state, without physics.
 - URDF: EVGP with `NominalDynamics` of a robot whose masses, centres of mass and inertias are 20 % off, with random
   signs.
 - parameters: the same, with learned factors on masses, inertias and the length of the second link.
-- truth: the true robot as the model, which is the limit of the controller.
-- TVLQR: feedback of the leaderboard's controller of this name, along one plan on the true robot. It checks the
-  simulator.
+- truth: the true robot as the model, a reference for the controller.
+- TVLQR: feedback with the weights of the leaderboard's controller of this name, along one of our plans on the true
+  robot. It checks the simulator.
 
 Columns of the CSV: ``seconds`` of data, 0 for the true model; six shares, whose mean is ``score``; ``swings_up``, the
 success without disturbances; ``both``, the share of pulses on both joints, which is not in the score; ``step_ms``,

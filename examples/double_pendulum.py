@@ -202,7 +202,7 @@ class Truth:
 
 # --- data and models -------------------------------------------------------------------------------------------------
 
-# Noise of the sensors, rad and rad/s. A run ends at this speed, rad/s, as on the real robot.
+# Noise of the sensors, rad and rad/s. A run ends at this speed, rad/s.
 SENSORS = Disturbances(position_noise=1e-3, velocity_noise=0.05)
 FASTEST = 30.0
 # Rows of 500 Hz from a state to the next, and the cutoff frequency of the filter of the log, Hz.
@@ -342,7 +342,8 @@ def regressor(robot: str, kind: str, seed: int = 0, **options: Any) -> Any:
     """Return a model of the state after 0.01 s.
 
     ``kind`` is "IFG" (EVGP with rough physics, masses unknown), "GP" (without physics), "URDF" (EVGP with a rigid-body
-    model that is 20 % off) or "parameters" (the same, whose masses, lengths and inertias are learned).
+    model that is 20 % off) or "parameters" (the same, whose masses, inertias and
+    length of the second link are learned).
     """
     known = system(robot, seed) if kind in ("URDF", "parameters") else system(robot)
     options = {"kernel_map": AngleEncoder(known), "n_inducing": 100, "random_state": seed, **options}

@@ -46,7 +46,8 @@ def log_transitions(
     stride : int, default=1
         Number of recorded rows from a state to the next, at least 1. Transitions do not overlap. The torque is the mean
         of the rows between, weighted by their durations. From 4 rows on, the velocity of a state is its mean over half
-        of this number of rows around the state, because a velocity of a single row is noisy.
+        of this number of rows around the state, because a velocity of a single row is noisy. The torque is then
+        averaged in the same way, so that it belongs to the change of these velocities.
     align : bool, default=True
         Whether to take positions at the time of the velocities, and to average velocities. If False, states are those
         of the recording.
@@ -82,8 +83,9 @@ def log_transitions(
 
     Notes
     -----
-    Without ``delay="auto"``, the torque of a row is held until the next row. The torque of the next row is not used,
-    because a controller computes it from the noisy target.
+    Without ``delay="auto"``, the torque of a row is held until the next row. With fewer than 4 rows, or without
+    ``align``, torques of later rows are not used, because a controller computes them from the noisy target. From 4 rows
+    on, torques of up to a quarter of the stride after the target count.
 
     Examples
     --------
