@@ -564,7 +564,9 @@ class Follower:
         self._gain = kalman_gain(noise, unknown, step)
         self._moved = 12.0 * noise[0]
         self.delay, self._answered = np.zeros(n, dtype=int), np.full(n, nodes is not None)
-        self._planned_answer = -1
+        # The first states of the plan, those that it expects now, and the step at which these have moved (-1: not yet).
+        self._rest = self._expected = library.Z[self.node]
+        self._planned_answer = np.full(n, -1)
 
     # --- states ---
 
@@ -584,8 +586,6 @@ class Follower:
         """Return present states. ``self._z`` has the filtered states at the time of the measurement."""
         if self._count == 0:
             self._z = measured.copy()
-            self._rest = measured.copy()
-            self._expected = measured.copy()
             return measured
         u = self._inputs[self.delay, np.arange(self.n)]
         z = self._advance(self._z, u, self.node, self.at_goal, self.step)
@@ -605,14 +605,15 @@ class Follower:
 
     def _find_delay(self, measured: np.ndarray, d: int) -> None:
         """Compare the time of the first answer of the arm to that of the plan."""
-        if self._planned_answer < 0:
-            self._expected = self._advance(self._expected, self._inputs[0], self.node, self.at_goal, self.step)
-            if np.abs(self._expected - self._rest)[0, :d].max() > self._moved:
-                self._planned_answer = self._count
-        moved = (np.abs(measured - self._rest)[:, :d].max(axis=1) > self._moved) & ~self._answered
-        if self._planned_answer >= 0 and moved.any():
-            self.delay[moved] = np.clip(self._count - self._planned_answer, 0, _LATEST)
-            self._answered |= moved
+        self._expected = self._advance(self._expected, self._inputs[0], self.node, self.at_goal, self.step)
+        expected, moved = (
+            np.abs(self.library.task.difference(z, self._rest))[:, :d].max(axis=1) > self._moved
+            for z in (self._expected, measured)
+        )
+        self._planned_answer[expected & (self._planned_answer < 0)] = self._count
+        moved &= ~self._answered & (self._planned_answer >= 0)
+        self.delay[moved] = np.clip(self._count - self._planned_answer[moved], 0, _LATEST)
+        self._answered |= moved
         self._answered |= self._count > 10 * _LATEST
 
     def _predicted(self, z: np.ndarray, late: np.ndarray) -> np.ndarray:

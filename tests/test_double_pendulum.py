@@ -106,7 +106,12 @@ def test_the_true_model_swings_up_and_survives_a_delay(own, robot):
     model = own.Truth(own.Plants(robot))
     library = own.controller_of(model, own.plan_swing_ups(model, np.random.RandomState(0)))
     disturbances = replace(own.Disturbances(), delay=np.array([0, 10]), velocity_noise=np.array([0.0, 0.2]))
-    states, _ = own.simulate_plants(
-        own.Plants(robot), mpc.Follower(library, 2, own.STEP), np.zeros((2, 4)), disturbances
-    )
+    follower = mpc.Follower(library, 2, own.STEP)
+    states, _ = own.simulate_plants(own.Plants(robot), follower, np.zeros((2, 4)), disturbances)
     assert own.is_upright(states[-1]).all()
+    # A plant alone finds its delay as it does next to others.
+    assert follower.delay.tolist() == [0, 10]
+    alone = mpc.Follower(library, 1, own.STEP)
+    noisy = replace(own.Disturbances(), delay=np.array([10]), velocity_noise=np.array([0.5]))
+    own.simulate_plants(own.Plants(robot), alone, np.zeros((1, 4)), noisy)
+    assert alone.delay.tolist() == [10]
