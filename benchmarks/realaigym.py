@@ -11,8 +11,8 @@ score are those of the leaderboards of RealAIGym (V2, simulation; dfki-ric-under
 
 A run of the benchmark learns as in examples/double_pendulum.py. The first 10 s of data are random torques. Each
 following stage is recorded with the controller that was learned from all earlier data. The controller has plans by
-iLQR, time-varying LQR along the plans and LQR at the goal (examples/mpc.py). It gets the learned model and measured
-states, and no equations of the true robot. The models are:
+iLQR, time-varying LQR along the plans and LQR at the goal (examples/follow_plans.py). It gets the learned model and
+measured states, and no equations of the true robot. The models are:
 
 - IFG: EVGP with `InertiaForceGravity`. Masses, centres of mass and inertias are unknown.
 - GP: a Gaussian process for the change of the state, without physics.
@@ -67,7 +67,7 @@ from double_pendulum import (
     simulate_plants,
     study,
 )
-from mpc import Follower, Library
+from follow_plans import Follower, Library
 
 ROBOTS = tuple(DRIVEN)
 MODELS = {

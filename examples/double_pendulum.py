@@ -21,7 +21,7 @@ import numpy as np
 from sklearn.pipeline import make_union
 from sklearn.utils import Bunch
 
-from mpc import Follower, Library, Reach, plan_many, sampled_slopes, waves
+from follow_plans import Follower, Library, Reach, plan_many, sampled_slopes, waves
 from skevgp import EVGPRegressor, ResidualRegressor
 from skevgp.datasets import load_log
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LogNormal, NominalDynamics

@@ -12,7 +12,7 @@ it fall. So half of the tries start near the top, and the feedback is computed f
 ``sample_functions`` draws have different slopes, and the gain has the lowest expected cost over all of them.
 
 Robot, limits and noise are those of the simulated benchmark RealAIGym. The page :doc:`/guide/realaigym` has the scores.
-The simulation is in ``double_pendulum.py`` and the controllers are in ``mpc.py``, both next to this file.
+The simulation is in ``double_pendulum.py`` and the controllers are in ``follow_plans.py``, both next to this file.
 """
 
 # %%
@@ -28,7 +28,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from double_pendulum import DRIVEN, LENGTHS, LIMIT, STEP, Plants, Truth, is_upright, simulate_plants, study
-from mpc import Follower
+from follow_plans import Follower
 
 parser = argparse.ArgumentParser(description="Let an acrobot learn to stand up.")
 parser.add_argument("--robot", choices=sorted(DRIVEN), default="acrobot", help="default: %(default)s")

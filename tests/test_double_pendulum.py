@@ -20,7 +20,7 @@ def own(monkeypatch):
     """The module, with the folder of examples on the path."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
     yield importlib.import_module("double_pendulum")
-    for name in ("double_pendulum", "mpc"):
+    for name in ("double_pendulum", "follow_plans"):
         sys.modules.pop(name, None)
 
 
@@ -67,7 +67,7 @@ def test_disturbances_are_those_asked_for(own):
 
 
 def test_feedback_at_rest_is_lqr_and_more_cautious_with_doubt(own):
-    mpc = importlib.import_module("mpc")
+    control = importlib.import_module("follow_plans")
     F = own.Truth(own.Plants("acrobot")).value_and_jacobian(np.append(own.GOAL, 0.0)[np.newaxis])[1]
     Q, R = own.TASK.dt * np.diag(own.TASK.top_state_cost), own.TASK.dt * own.TASK.top_input_cost
     A, B = F[0, :, :4], F[0, :, 4:]
@@ -75,11 +75,11 @@ def test_feedback_at_rest_is_lqr_and_more_cautious_with_doubt(own):
     lqr = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)[0]
     plans = own.Bunch(Z=np.tile(own.GOAL, (1, 3, 1)), U=np.zeros((1, 2)))
     model = own.Truth(own.Plants("acrobot"))
-    certain = mpc.Library(model, own.TASK, plans.Z, plans.U)
+    certain = control.Library(model, own.TASK, plans.Z, plans.U)
     assert_allclose(certain.top_gain, lqr, rtol=1e-5)
     deviations = np.zeros((2, 4, 5))
     deviations[:, 3, 1] = 0.02, -0.02
-    doubtful = mpc.Library(model, own.TASK, plans.Z, plans.U, deviations)
+    doubtful = control.Library(model, own.TASK, plans.Z, plans.U, deviations)
     assert np.linalg.norm(doubtful.top_gain) > 1.05 * np.linalg.norm(lqr)
     # The expected cost to go of the closed loop is what the Riccati equation says.
     closed = [D[:, :4] + np.outer(D[:, 4], doubtful.top_gain) for D in F[0] + deviations]
@@ -87,7 +87,7 @@ def test_feedback_at_rest_is_lqr_and_more_cautious_with_doubt(own):
     cost = cost + np.mean([D.T @ doubtful.top_cost @ D for D in closed], axis=0)
     assert_allclose(doubtful.top_cost, cost, rtol=1e-4, atol=1e-6)
     # No gain is safe against a doubt of this size: half of it, again and again, is taken.
-    assert np.isfinite(mpc.Library(model, own.TASK, plans.Z, plans.U, 1e3 * deviations).top_gain).all()
+    assert np.isfinite(control.Library(model, own.TASK, plans.Z, plans.U, 1e3 * deviations).top_gain).all()
 
 
 def test_filtered_rows_are_those_of_the_true_robot(own):
@@ -102,16 +102,16 @@ def test_filtered_rows_are_those_of_the_true_robot(own):
 @pytest.mark.long
 @pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 def test_the_true_model_swings_up_and_survives_a_delay(own, robot):
-    mpc = importlib.import_module("mpc")
+    control = importlib.import_module("follow_plans")
     model = own.Truth(own.Plants(robot))
     library = own.controller_of(model, own.plan_swing_ups(model, np.random.RandomState(0)))
     disturbances = replace(own.Disturbances(), delay=np.array([0, 10]), velocity_noise=np.array([0.0, 0.2]))
-    follower = mpc.Follower(library, 2, own.STEP)
+    follower = control.Follower(library, 2, own.STEP)
     states, _ = own.simulate_plants(own.Plants(robot), follower, np.zeros((2, 4)), disturbances)
     assert own.is_upright(states[-1]).all()
     # A plant alone finds its delay as it does next to others.
     assert follower.delay.tolist() == [0, 10]
-    alone = mpc.Follower(library, 1, own.STEP)
+    alone = control.Follower(library, 1, own.STEP)
     noisy = replace(own.Disturbances(), delay=np.array([10]), velocity_noise=np.array([0.5]))
     own.simulate_plants(own.Plants(robot), alone, np.zeros((1, 4)), noisy)
     assert alone.delay.tolist() == [10]
