@@ -186,13 +186,12 @@ class Truth:
     def __init__(self, plants: Plants, dt: float = 0.01):
         self.plants, self.n_substeps, self.h = plants, max(round(dt / 0.005), 1), dt / max(round(dt / 0.005), 1)
 
-    def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
+    def predict(self, X: np.ndarray) -> np.ndarray:
         rows = np.moveaxis(X, -1, 0)
         z, tau = rows[:4], self.plants.torques(rows[4])
         for _ in range(self.n_substeps):
             z = self.plants.advance(z, *tau, h=self.h)
-        found = np.moveaxis(z, 0, -1)
-        return (found, np.zeros_like(found)) if return_std else found
+        return np.moveaxis(z, 0, -1)
 
     def value_and_jacobian(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         steps = 1e-6 * np.eye(5)
@@ -373,7 +372,7 @@ def plan_swing_ups(model: Any, rng: np.random.RandomState, known: np.ndarray | N
     U = waves(N_STARTS, HORIZON, DT, 0.5 * LIMIT, rng)
     if known is not None:
         U = np.concatenate([known, U[: N_STARTS - 2 * len(known)]])
-    return plan_many(model, TASK, np.zeros((len(U), 4)), U, n_iter)
+    return plan_many(model, TASK, np.zeros(4), U, n_iter)
 
 
 def controller_of(model: Any, plans: Bunch, regressor: Any = None) -> Library:
@@ -390,8 +389,7 @@ def study(
     Yields
     ------
     stage : Bunch
-        ``seconds`` of data, ``rows`` of `transitions`, ``regressor``, ``model`` (compiled), ``plans``, ``library`` and
-        ``fit_seconds``, processor time.
+        ``seconds`` of data, ``model`` (compiled), ``plans``, ``library`` and ``fit_seconds``, processor time.
     """
     rng, runs, library, known, recorded = np.random.RandomState(seed), list[Run](), None, None, 0.0
     for number, seconds in enumerate(stages):
@@ -408,8 +406,6 @@ def study(
         library, known = controller_of(model, plans, fitted), plans.U[:4]
         yield Bunch(
             seconds=seconds,
-            rows=rows,
-            regressor=fitted,
             model=model,
             plans=plans,
             library=library,

@@ -62,15 +62,15 @@ class Reach:
         return found
 
 
-def plan_many(model: Any, task: Reach, starts: np.ndarray, U: np.ndarray, n_iter: int = 60) -> Bunch:
-    """Plan from many states at once by iLQR. Each plan has its own damping and step length.
+def plan_many(model: Any, task: Reach, start: np.ndarray, U: np.ndarray, n_iter: int = 60) -> Bunch:
+    """Plan from a state by iLQR, with many first inputs at once. Each plan has its own damping and step length.
 
     Parameters
     ----------
     model : CompiledPredictor
         Or an object with the same `predict` and `value_and_jacobian`. Rows are [state, input].
     task : Reach
-    starts : ndarray of shape (n_plans, n_states)
+    start : ndarray of shape (n_states,)
     U : ndarray of shape (n_plans, horizon)
         First inputs.
     n_iter : int, default=60
@@ -81,7 +81,7 @@ def plan_many(model: Any, task: Reach, starts: np.ndarray, U: np.ndarray, n_iter
         ``Z`` (n_plans, horizon + 1, n_states), ``U`` (n_plans, horizon) and ``cost`` (n_plans,), best plans first.
     """
     n, horizon = U.shape
-    d = starts.shape[1]
+    d = len(start)
     encoder = AngleEncoder(angles=task.angles).fit(np.zeros((1, d)))
     goal = encoder.transform(np.array([task.goal]))[0]
     weights = np.tile(task.weights[:-1], (horizon + 1, 1))
@@ -95,7 +95,7 @@ def plan_many(model: Any, task: Reach, starts: np.ndarray, U: np.ndarray, n_iter
         """Return new plans (n, n_steps, ...) and their costs."""
         tried = np.empty((n, len(steps), horizon))
         states = np.empty((n, len(steps), horizon + 1, d))
-        states[:, :, 0] = starts[:, np.newaxis]
+        states[:, :, 0] = start
         for t in range(horizon):
             answer = ((states[:, :, t] - Z[:, np.newaxis, t]) * gain[:, np.newaxis, t]).sum(axis=2)
             tried[:, :, t] = U[:, np.newaxis, t] + steps * change[:, np.newaxis, t] + answer
