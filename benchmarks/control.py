@@ -275,7 +275,7 @@ SWING_UPS = {
     "gp": "without physics",
     "truth": "the truth",
 }
-# Systems of these models only.
+# Systems of the model "second".
 SECOND_ORDER = ("pendulum",)
 
 # One run. The truth has no data, and seeds differ in the first plans and in the noise.
@@ -310,8 +310,8 @@ class Truth:
         return (mean, slopes, np.zeros_like(mean), np.zeros_like(slopes)) if return_std else (mean, slopes)
 
 
-def rotated_gravity(X: np.ndarray) -> np.ndarray:
-    """Return q̇ cos q of a pendulum."""
+def rate_of_gravity(X: np.ndarray) -> np.ndarray:
+    """Return q̇ cos q of a pendulum, the derivative of the feature sin q with respect to time."""
     return X[:, 1:2] * np.cos(X[:, :1])
 
 
@@ -321,12 +321,12 @@ def settings_of(model: str, system: str) -> dict[str, Any]:
         return {"kernel": ConstantKernel(1e-10, "fixed") * RBF(1.0, "fixed")}
     if model == "second":
         gravity = InertiaForceGravity(system, dt=mpc.DT)
-        return {"feature_map": make_union(gravity, FunctionTransformer(rotated_gravity))}
+        return {"feature_map": make_union(gravity, FunctionTransformer(rate_of_gravity))}
     return {}
 
 
 def scatter(system: str, seed: int) -> np.ndarray:
-    """Return the standard deviation of each state in the largest data."""
+    """Return the standard deviation of each state in the largest data, of which the noise is a share."""
     n_trajectories = round(SECONDS[-1] / (mpc.LENGTH * mpc.DT))
     return make_dynamics(system, n_trajectories, mpc.LENGTH, dt=mpc.DT, random_state=seed).target.std(axis=0)
 

@@ -57,7 +57,7 @@ class StackedWhitening:
     @property
     def L_inv(self) -> np.ndarray:
         """The inverse of L."""
-        return block_diag(*(part.L_inv / np.sqrt(c) for c, part in self._pairs()))
+        return block_diag(*self._inverses)
 
     def times_inverse(self, U: np.ndarray) -> np.ndarray:
         """L⁻¹ U for U (..., m, n)."""
